@@ -340,8 +340,8 @@ class Compensator(Protocol):
 
     The machine limits the slew rate itself, and ramps to zero if `write` is not called within the time of its
     watchdog. ``open`` and `read` change nothing. After a lost connection ``open`` connects again. ``conformance()``
-
-    (optional) returns the `CompensatorSubject` for the conformance kit.
+    (optional) returns the `CompensatorSubject` for the conformance kit. ``note`` (optional, a text) states what the
+    machine does not guarantee, such as that it has only one writer.
     """
 
     info: ClassVar[InstrumentInfo]
@@ -359,7 +359,7 @@ class Compensator(Protocol):
         """Return the identity of the machine at the address."""
 
     def arm(self, limit: float) -> None:
-        """Allow `write` to send offsets up to a limit of each axis, m, until `close`; nothing is sent.
+        """Allow `write` to send offsets up to a limit of each axis, m, until `close`; no offset is sent.
 
         Raises InstrumentError if the machine cannot accept such offsets.
         """

@@ -393,7 +393,8 @@ def test_two_state_folders_do_not_arm_one_output(
             replace(plan, compensator=BenchCompensator(ModbusRegisters, url, settings, LIMITS))
             for url in (f"modbus+tcp://127.0.0.1:{port}", f"modbus+tcp://LOCALHOST:{port}?unit=1")
         )
-        with Compensation(first, model, tmp_path / "one", arm=MACHINE, clock=SimulatedClock()):
+        with Compensation(first, model, tmp_path / "one", arm=MACHINE, clock=SimulatedClock()) as armed:
+            assert "states no owner of its offsets" in armed.note
             monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
             with (
                 pytest.raises(RunError, match=r"is in use by another program: an armed compensation of user"),

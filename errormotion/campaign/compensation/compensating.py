@@ -103,7 +103,8 @@ class Compensation:
     armed : bool
         Whether offsets are written.
     note : str
-        Why other users' programs may not see that this one uses the instruments; empty if they do.
+        Which other programs may not see that this one uses the instruments, or are not refused; empty if there are
+        none.
 
     Raises
     ------
@@ -206,6 +207,8 @@ class Compensation:
                 self._output = each.driver(each.address, each.settings)
                 self._output.open()
                 stack.callback(self._close)
+                if self.armed:
+                    self.note = " ".join(filter(None, (self.note, getattr(self._output, "note", ""))))
             stack.enter_context(self._monitor)
             held.records(self.folder.path)
             self._audit = stack.enter_context(AuditLog(self.folder.path / AUDIT))

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
+from errormotion.instruments.compensator.owner import NO_OWNER, Owner
 from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings, runs
 from errormotion.instruments.modbus_driver import ModbusDriver
 from errormotion.instruments.transports.modbus.client import READ_HOLDING
@@ -63,10 +64,13 @@ class ModbusRegisters(ModbusDriver):
         super().__init__(address, settings, record=record)
         self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._heartbeat = 0
+        self._owner = Owner(f"{self.info.id} at {address}", self._read_owner, self._write_owner)
+        self.note = "" if self.settings.owner is not None else NO_OWNER
 
     def close(self) -> None:
         """Disconnect and disarm; the watchdog of the PLC ramps to zero. Idempotent."""
         self._door.disarm()
+        self._owner.release()
         super().close()
 
     def identify(self) -> Identity:
@@ -75,12 +79,13 @@ class ModbusRegisters(ModbusDriver):
         return self.identity("holding registers")
 
     def arm(self, limit: float) -> None:
-        """Permit offsets up to a limit for each axis, m; nothing is sent.
+        """Permit offsets up to a limit for each axis, m; nothing is sent but the owner, if it has a register.
 
         Raises
         ------
         InstrumentError
-            The registers cannot represent this limit, or one count is more than the limit.
+            The registers cannot represent this limit, one count is more than the limit, or another program is the
+            owner.
         """
         largest, scale = self.settings.largest, self.settings.scale
         if not scale <= limit <= largest:
@@ -88,6 +93,8 @@ class ModbusRegisters(ModbusDriver):
                 f"{self.address}: the registers represent offsets from {scale * 1e6:g} um to {largest * 1e6:g} um; the "
                 f"limit is {limit * 1e6:g} um. Change 'scale' or 'type'"
             )
+        if self.settings.owner is not None:
+            self._owner.take()
         self._door.arm(limit)
 
     def read(self) -> Applied:
@@ -114,11 +121,13 @@ class ModbusRegisters(ModbusDriver):
         Raises
         ------
         InstrumentError
-            The driver is not armed, or an offset is beyond the limit or not finite: nothing was sent. For other errors
-            see `ModbusLine.write_registers`.
+            The driver is not armed, another program is the owner, or an offset is beyond the limit or not finite: no
+            offset was sent. For other errors see `ModbusLine.write_registers`.
         """
         line, settings = self.line, self.settings
         values = self._door.offset(offset)
+        if settings.owner is not None:
+            self._owner.require()
         most = int(self._door.limit * (1 + ROUNDING) / settings.scale)
         words: dict[int, int] = {}
         for first, value in zip(settings.offset, values, strict=True):
@@ -130,6 +139,13 @@ class ModbusRegisters(ModbusDriver):
         alive = settings.heartbeat
         for first, part in sorted(parts, key=lambda part: part[0] <= alive < part[0] + len(part[1])):
             line.write_registers(first, part, function=settings.function)
+
+    def _read_owner(self) -> int:
+        (found,) = self.line.registers(READ_HOLDING, self.settings.owner or 0, 1)
+        return int(found)
+
+    def _write_owner(self, number: int) -> None:
+        self.line.write_registers(self.settings.owner or 0, [number], function=self.settings.function)
 
     def _state(self, found: dict[int, int], name: str) -> str:
         register = getattr(self.settings, name)

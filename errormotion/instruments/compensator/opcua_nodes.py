@@ -7,7 +7,7 @@ its own limit of the offset.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
+from errormotion.instruments.compensator.owner import NO_OWNER, Owner
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.opc import open_session, request
@@ -26,6 +27,8 @@ SIGNED = {"SByte": 7, "Int16": 15, "Int32": 31, "Int64": 63}
 UNSIGNED = {"Boolean": 1, "Byte": 8, "UInt16": 16, "UInt32": 32, "UInt64": 64}
 """Integer types, and the number of bits of their largest value."""
 FRACTIONS = ("Float", "Double")
+OWNER_BITS = 15
+"""Number of bits of the number of an owner."""
 BEATS = 1 << 15
 """Number of values of the heartbeat, unless its type has fewer."""
 IDENTITY = {"manufacturer": "i=2263", "model": "i=2261", "firmware": "i=2264"}
@@ -44,6 +47,11 @@ class OpcUaNodesSettings(PluginSettings):
     busy: str = Field(
         default="", description="id of a node that is neither 0 nor false while the offset must not change"
     )
+    owner: str = Field(
+        default="",
+        description="id of an integer node with the number of the program that writes, 0 for none, which the machine "
+        "sets to 0 when its watchdog ends a compensation; a second program is refused",
+    )
     scale: Length = Field(default=1e-3, description="offset for the number 1 in a node", gt=0, le=1)
     security: str = Field(
         default="", description="'Basic256Sha256,SignAndEncrypt,client.der,client.pem'; empty: no encryption"
@@ -54,7 +62,7 @@ class OpcUaNodesSettings(PluginSettings):
 
     @model_validator(mode="after")
     def _different(self) -> Self:
-        ids = [*self.offset, *(self.applied or ()), *filter(None, (self.heartbeat, self.stop, self.busy))]
+        ids = [*self.offset, *(self.applied or ()), *filter(None, (self.heartbeat, self.stop, self.busy, self.owner))]
         if double := next((each for each in ids if ids.count(each) > 1), None):
             raise ValueError(f"the node '{double}' is named twice")
         if not all((*self.offset, self.heartbeat)):
@@ -100,10 +108,14 @@ class OpcUaNodes(Driver):
         self._door = OffsetDoor(f"{self.info.id} at {address}")
         self._types: list[str] = []
         self._beat, self._beats = 0, BEATS
+        self._owner = Owner(f"{self.info.id} at {address}", self._read_owner, self._write_owner)
+        self._owner_type = ""
+        self.note = "" if self.settings.owner else NO_OWNER
 
     def close(self) -> None:
         """Disconnect and disarm; the watchdog at the other end ramps to zero. Idempotent."""
         self._door.disarm()
+        self._owner.release()
         super().close()
 
     def identify(self) -> Identity:
@@ -119,12 +131,12 @@ class OpcUaNodes(Driver):
         )
 
     def arm(self, limit: float) -> None:
-        """Permit offsets up to a limit for each axis, m; nothing is sent.
+        """Permit offsets up to a limit for each axis, m; nothing is sent but the owner, if it has a node.
 
         Raises
         ------
         InstrumentError
-            A node of integers cannot represent this limit.
+            A node of integers cannot represent this limit, or another program is the owner.
         """
         scale = self.settings.scale
         for node, kind in zip(self.settings.offset, self._types, strict=False):
@@ -136,6 +148,8 @@ class OpcUaNodes(Driver):
                     f"{self.address}: node '{node}' ({kind}) represents offsets from {scale * 1e6:g} um to "
                     f"{largest * 1e6:g} um; the limit is {limit * 1e6:g} um. Change 'scale'"
                 )
+        if self.settings.owner:
+            self._owner.take()
         self._door.arm(limit)
 
     def read(self) -> Applied:
@@ -157,21 +171,39 @@ class OpcUaNodes(Driver):
         Raises
         ------
         InstrumentError
-            The driver is not armed, or an offset is beyond the limit or not finite: nothing was sent. Or the connection
-            is lost, or the server did not accept a value.
+            The driver is not armed, another program is the owner, or an offset is beyond the limit or not finite: no
+            offset was sent. Or the connection is lost, or the server did not accept a value.
         """
         line, settings = self.transport, self.settings
         numbers = [self._held(kind, x) for kind, x in zip(self._types, self._door.offset(offset), strict=False)]
+        if settings.owner:
+            self._owner.require()
         self._beat = (self._beat + 1) % self._beats
         beat = bool(self._beat) if self._types[-1] == "Boolean" else self._beat
         nodes = (*settings.offset, settings.heartbeat)
         values = [list(each) for each in zip(nodes, self._types, [*numbers, beat], strict=True)]
+        self._send(line, values, "the offset")
+
+    def _send(self, line: Transport, values: list[list[Any]], what: str) -> None:
+        """Write values, each with its node and type."""
         statuses = request(line, {"write": values})
-        if not isinstance(statuses, list) or len(statuses) != len(nodes):
-            raise ProtocolError(f"{self.address}: expected {len(nodes)} statuses; found {str(statuses)[:80]}")
-        refused = [f"{node}: {str(each)[:60]}" for node, each in zip(nodes, statuses, strict=True) if each != "Good"]
+        if not isinstance(statuses, list) or len(statuses) != len(values):
+            raise ProtocolError(f"{self.address}: expected {len(values)} statuses; found {str(statuses)[:80]}")
+        refused = [
+            f"{node}: {str(each)[:60]}" for (node, *_), each in zip(values, statuses, strict=True) if each != "Good"
+        ]
         if refused:
-            raise InstrumentError(f"{self.address}: the server did not accept the offset: {', '.join(refused)}")
+            raise InstrumentError(f"{self.address}: the server did not accept {what}: {', '.join(refused)}")
+
+    def _read_owner(self) -> int:
+        (found,) = self._values([self.settings.owner])
+        number = _number(found)
+        if not math.isfinite(number):
+            raise InstrumentError(f"{self.address}: node '{self.settings.owner}' {_reason(found)}; expected the owner")
+        return int(number)
+
+    def _write_owner(self, number: int) -> None:
+        self._send(self.transport, [[self.settings.owner, self._owner_type, number]], "the owner")
 
     def _held(self, kind: str, offset: float) -> float:
         """Return the number that represents an offset, m, in a node of this type, never beyond the limit."""
@@ -201,13 +233,18 @@ class OpcUaNodes(Driver):
     def _start_session(self) -> None:
         """Check the nodes, and continue from the last heartbeat, so that the first write changes it."""
         settings = self.settings
-        nodes = (*settings.offset, settings.heartbeat)
+        nodes = (*settings.offset, settings.heartbeat, *filter(None, (settings.owner,)))
         found = request(self.transport, {"describe": list(nodes)})
         if not isinstance(found, list) or len(found) != len(nodes) or not all(isinstance(each, dict) for each in found):
             raise ProtocolError(f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}")
-        self._types = [str(each.get("type")) for each in found]
-        for node, each, kind in zip(nodes, found, self._types, strict=True):
-            allowed = {**SIGNED, **UNSIGNED} if node == settings.heartbeat else (*SIGNED, *FRACTIONS)
+        types = [str(each.get("type")) for each in found]
+        self._types, self._owner_type = types[:4], types[-1]
+        for node, each, kind in zip(nodes, found, types, strict=True):
+            allowed: Collection[str] = (*SIGNED, *FRACTIONS)
+            if node == settings.heartbeat:
+                allowed = (*SIGNED, *UNSIGNED)
+            elif node == settings.owner:
+                allowed = [name for name, bits in {**SIGNED, **UNSIGNED}.items() if bits >= OWNER_BITS]
             if each.get("status") != "Good" or not each.get("writable") or kind not in allowed or each.get("array"):
                 array = "array of " if each.get("array") else ""
                 raise InstrumentError(

@@ -27,6 +27,11 @@ class RegisterSettings(TwoWireSettings):
     )
     stop: int | None = Field(default=None, description="register that is not 0 while the PLC accepts no offsets")
     busy: int | None = Field(default=None, description="register that is not 0 while the offset must not change")
+    owner: int | None = Field(
+        default=None,
+        description="register with the number of the program that writes, 0 for none, which the PLC sets to 0 when its "
+        "watchdog ends a compensation; a second program is refused",
+    )
     type: Literal["i16", "i32"] = Field(default="i32", description="type of a number: signed, in one or two registers")
     word_order: Literal["big", "little"] = Field(
         default="big", description="order of two registers; big: the upper 16 bits first"
@@ -60,7 +65,7 @@ class RegisterSettings(TwoWireSettings):
             yield "offset", register, SIZES[self.type]
         for register in self.applied or ():
             yield "applied", register, SIZES[self.type]
-        for name in ("heartbeat", "stop", "busy"):
+        for name in ("heartbeat", "stop", "busy", "owner"):
             register = getattr(self, name)
             if register is not None:
                 yield name, register, 1

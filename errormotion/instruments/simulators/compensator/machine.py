@@ -51,7 +51,7 @@ class MachinePart:
         self._offset: Offset = (0.0, 0.0, 0.0)
         self._target: Offset = (0.0, 0.0, 0.0)
         self._at = self._now()
-        self._alive_until = -math.inf
+        self._alive_until = self._begun = -math.inf
 
     @property
     def offset(self) -> Offset:
@@ -79,6 +79,17 @@ class MachinePart:
             self._target = x, y, z
             if alive:
                 self._alive_until = now + self.watchdog
+
+    @property
+    def alive(self) -> bool:
+        """Whether the watchdog has not expired since the last heartbeat, or since `begin`."""
+        with self._lock:
+            return self._now() < max(self._alive_until, self._begun + self.watchdog)
+
+    def begin(self) -> None:
+        """Start the time in which the first heartbeat of a new owner is expected."""
+        with self._lock:
+            self._begun = self._now()
 
     def elapse(self, seconds: float) -> None:
         """Advance the time of the machine, s, in addition to the clock."""

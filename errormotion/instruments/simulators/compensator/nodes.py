@@ -24,6 +24,7 @@ MM = 1e-3
 WRITABLE = 3
 """Access level: can be read and written."""
 NAMESPACE = "urn:errormotion:machine"
+OWNER = "Owner"
 INDEX = 2
 """Index of the namespace of the nodes."""
 
@@ -32,8 +33,9 @@ class SimulatedNodes:
     """A machine with the nodes ``Offset.X`` to ``Z`` and ``Heartbeat`` for writing.
 
     The offset in effect is in ``Applied.X`` to ``Z``; further nodes are ``Stop`` and ``Busy``, all in namespace 2.
-    Offsets are Double in mm, the heartbeat is a UInt32, the states are Boolean. Parameters of the address: those of
-    `MachinePart`.
+    Offsets are Double in mm, the heartbeat is a UInt32, the states are Boolean. With the parameter ``owner=1``, the
+    node ``Owner``, UInt16, is that of the owner: it is set to 0 when the watchdog has expired. Further parameters of
+    the address: those of `MachinePart`.
 
     Faults in addition to those of all devices: ``unavailable`` (values have a bad status) and ``refused`` (writes are
     refused).
@@ -52,6 +54,7 @@ class SimulatedNodes:
     def __init__(self, address: Address) -> None:
         self.fault = parse_fault(address, self.faults)
         self.machine = MachinePart(address)
+        self.owned = bool(address.whole("owner", 0, 1))
         self._outgoing = Outgoing(self.fault, np.random.default_rng(int(address.number("seed", 0))), lambda: None)
         self._path = address.path or "nodes"
         self._host, self._port = listening_at()
@@ -88,6 +91,7 @@ class SimulatedNodes:
             "stop": self._id("Stop").to_string(),
             "busy": self._id("Busy").to_string(),
             "scale": "1 mm",
+            **({"owner": self._id(OWNER).to_string()} if self.owned else {}),
         }
 
     def write(self, space: AddressSpace) -> None:
@@ -96,6 +100,10 @@ class SimulatedNodes:
         beat = self._value(space, "Heartbeat")
         alive, self._beat = beat != self._beat, beat
         self.machine.order([value * MM for value in offset], alive=alive)
+
+    def own(self) -> None:
+        """Start the watchdog of a new owner."""
+        self.machine.begin()
 
     # ------------------------------------------------------------------ in the thread of the server
 
@@ -106,6 +114,8 @@ class SimulatedNodes:
         for axis in AXES:
             self._add(space, inner.aspace, f"Offset.{axis}", 0.0, ua.VariantType.Double, writable=True)
         self._add(space, inner.aspace, "Heartbeat", 0, ua.VariantType.UInt32, writable=True)
+        if self.owned:
+            self._add(space, inner.aspace, OWNER, 0, ua.VariantType.UInt16, writable=True)
         self._beat = 0
         for i, axis in enumerate(AXES):
             self._live(space, f"Applied.{axis}", ua.VariantType.Double, lambda i=i: self.machine.offset[i] / MM)
@@ -163,6 +173,16 @@ class _Attributes(AttributeService):
     def __init__(self, space: AddressSpace, device: SimulatedNodes) -> None:
         super().__init__(space)
         self._space, self._device = space, device
+        self._owner = ua.NodeId(ua.String(OWNER), ua.Int16(INDEX))
+
+    def read(self, params: ua.ReadParameters) -> list[ua.DataValue]:
+        """Read attributes; an owner whose heartbeat has ended is none."""
+        if self._device.owned and not self._device.machine.alive:
+            for each in params.NodesToRead:
+                if each.NodeId == self._owner and each.AttributeId == AttributeIds.Value:
+                    free = ua.DataValue(ua.Variant(ua.UInt16(0), ua.VariantType.UInt16))
+                    self._space[self._owner].attributes[AttributeIds.Value].value = free
+        return super().read(params)
 
     async def write(self, params: ua.WriteParameters, user: User = User(role=UserRole.Admin)) -> list[ua.StatusCode]:  # noqa: B008 - as in the base class
         """Write attributes; return the status of each."""
@@ -170,6 +190,8 @@ class _Attributes(AttributeService):
         if ours and self._device.fault.kind == "refused":
             return [ua.StatusCode(ua.UInt32(StatusCodes.BadUserAccessDenied)) for _ in params.NodesToWrite]
         found = await super().write(params, user)
-        if ours:
+        if [each.NodeId for each in params.NodesToWrite] == [self._owner]:
+            self._device.own()
+        elif ours:
             self._device.write(self._space)
         return found

@@ -21,9 +21,10 @@ class SimulatedPlc(SimulatedModbusDevice):
     """A PLC with the program that is required of a machine.
 
     Registers: offsets, then the heartbeat; then offsets in effect, a stop and a busy register, which the PLC writes.
-    Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``unit`` (1), ``type``,
-    ``word_order``, ``scale`` and ``function`` as in the settings of the compensator, ``first`` (0, the first register),
-    and those of `MachinePart`.
+    With the parameter ``owner=1``, the next one is that of the owner, which the PLC sets to 0 when its watchdog has
+    expired. Further parameters of the address: ``framing`` (``tcp`` or ``rtu``; default by ``wire``), ``unit`` (1),
+    ``type``, ``word_order``, ``scale`` and ``function`` as in the settings of the compensator, ``first`` (0, the first
+    register), and those of `MachinePart`.
 
     Further faults: ``exception`` (an exception reply), ``unit`` (the answer of another device), ``short`` (an
     incomplete answer), ``checksum`` (RTU).
@@ -43,7 +44,7 @@ class SimulatedPlc(SimulatedModbusDevice):
         self.machine = MachinePart(address)
         self._words: dict[int, int] = {}
         self._heartbeat = 0
-        last = max(self._map.states) + 1
+        last = max(*self._map.states, self._map.owner or 0) + 1
         first = min(self._map.offset)
         super().__init__(address, "plc")
         self._device = ModbusServer(self._framing, self._unit, 3, {first: last - first}, self._registers, self._written)
@@ -53,6 +54,10 @@ class SimulatedPlc(SimulatedModbusDevice):
         if self.fault.hits("exception", self._answers):
             return FAILURE
         found, plc = dict(self._words), self._map
+        if plc.owner is not None:
+            if not self.machine.alive:
+                self._words.pop(plc.owner, None)
+            found[plc.owner] = self._words.get(plc.owner, 0)
         for first, value in zip(plc.applied or (), self.machine.offset, strict=True):
             found.update(enumerate(plc.words(round(value / plc.scale)), start=first))
         for register, text in ((plc.stop, self.machine.fault), (plc.busy, self.machine.busy)):
@@ -65,6 +70,10 @@ class SimulatedPlc(SimulatedModbusDevice):
         if self.fault.hits("exception", self._answers):
             return FAILURE
         plc, size = self._map, SIZES[self._map.type]
+        if list(registers) == [plc.owner]:
+            self._words.update(registers)
+            self.machine.begin()
+            return 0
         if max(registers) > plc.heartbeat:
             return REFUSED
         self._words.update(registers)
@@ -90,6 +99,8 @@ def _settings(address: Address) -> dict[str, object]:
         "stop": state + 3 * size,
         "busy": state + 3 * size + 1,
     }
+    if address.whole("owner", 0, 1):
+        given["owner"] = state + 3 * size + 2
     try:
         RegisterSettings.model_validate(given)
     except ValidationError as error:
