@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
-from errormotion.compensation.program.interpreter import agreement, canonical
+from errormotion.compensation.program.interpreter import agreement, canonical, paths
 from errormotion.compensation.program.interpreter.expanding import Expansion
 from errormotion.compensation.program.interpreter.screening import screen
 from errormotion.compensation.program.reading.frames import Triple
@@ -178,6 +178,14 @@ def _written(
         try:
             checked = agreement.check(
                 new, offsets, Reader(offsets, unit=unit, start=settings.start, deleted=settings.deleted)
+            )
+            original = [text for _, text in lines_of(_lines(program))]
+            paths.compare(
+                original,
+                new,
+                offsets,
+                rewriting.summary.largest + settings.tolerance,
+                deleted=settings.deleted,
             )
         except ProgramError as error:
             raise ProgramError(f"the check of the new program: {error}") from error

@@ -133,7 +133,7 @@ def commands(
         late.daemon = True
         late.start()
         try:
-            for command in _commands(process):
+            for command in _commands(process, own):
                 if parameters is not None and parameters.reads_tool and _leaves_tool(command):
                     where = lines[command.line - 1] if command.line else ""
                     raise refusal(command.line, where, "T0 or M61 in a program that reads values of the tool")
@@ -181,7 +181,7 @@ def _leaves_tool(command: Command) -> bool:
     return command.name == "CHANGE_TOOL_NUMBER" or (command.name == "CHANGE_TOOL" and command.text.strip() == "0")
 
 
-def _commands(process: subprocess.Popen[bytes]) -> Iterator[Command]:
+def _commands(process: subprocess.Popen[bytes], own: bool) -> Iterator[Command]:
     assert process.stdout is not None
     for count, raw in enumerate(process.stdout):
         if count > MAX_COMMANDS:
@@ -193,7 +193,7 @@ def _commands(process: subprocess.Popen[bytes]) -> Iterator[Command]:
                 raise ProgramError(f"LinuxCNC's interpreter printed '{line.strip()[:80]}'; expected a command")
             continue
         number = found[1]
-        if number == "0":  # the line before the program
+        if number == "0" and not own:  # the change to the tool that is unknown
             continue
         if found[2] == "SELECT_TOOL" and found[3] == str(UNKNOWN_TOOL):
             found = _COMMAND.match(line.replace(str(UNKNOWN_TOOL), "0"))
