@@ -149,6 +149,9 @@ class Programs:
         return [f"G{self.feed_mode}", *([] if self.feed_mode == 93 else [f"F{0.2 if self.feed_mode == 95 else 300}"])]
 
     def _other(self) -> list[str]:
+        if self.random.random() < 0.1 and self.feed_mode != 93:
+            self.motion = self.random.choice((0, 1))
+            return [f"G{self.motion}"]
         others = ("(comment)", "M9", "M5", "M3 S900", "G4 P0.5", "", "; text", "M64 P1", "G61", "G64 P0.01")
         return [self.random.choice(others)]
 

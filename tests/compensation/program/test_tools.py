@@ -22,7 +22,7 @@ TABLES = [
     ("T1 P1 Z\t5\n", (0, 0, 5), ""),
     ("T1 P1 Z100mm X-2\n", (-2, 0, 100), "as Z100"),
     ("T1 P1 Z5 Z6\n", (0, 0, 6), ""),
-    ("T1 Z5\n", (0, 0, 5), ""),
+    ("T1 Z5\n", (0, 0, 5), "loses this tool"),
     ("T1 Z5\nT1 P1 Z7\n", (0, 0, 7), "not used"),
     ("T2 Z5\nT1 Z4\n", (0, 0, 4), "replaces line 1"),
     ("; head\n\nt1 p1 z.5;x Z9\n", (0, 0, 0.5), ""),

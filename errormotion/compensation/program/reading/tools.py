@@ -135,11 +135,11 @@ def read_table(path: Path, unit: str = "mm") -> Table:
         if "P" in values:
             rows.append(row)
         else:
-            if loose is not None:
-                notes.append(
-                    f"{path.name}, line {number}: replaces line {loose[0]}, because neither has a pocket (P), as in "
-                    "LinuxCNC"
-                )
+            replaced = f", and replaces line {loose[0]}" if loose is not None else ""
+            notes.append(
+                f"{path.name}, line {number}: LinuxCNC reads no pocket (P){replaced}; it loses this tool when another "
+                "one is changed"
+            )
             loose = row
     offsets: dict[int, Array] = {}
     cutters: dict[int, Cutter] = {}
