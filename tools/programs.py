@@ -80,7 +80,7 @@ READING_KINDS = {
     "a program number": r"^O\d",
 }
 """Features of a program that reads its control, by name."""
-STEPS_OF_READING = (3, 12)
+STEPS_OF_READING = (10, 60)
 _USED = {name: re.compile(pattern, re.IGNORECASE) for name, pattern in KINDS.items()}
 
 

@@ -27,7 +27,7 @@ def control(random: Random, folder: Path) -> Offsets:
         words += [f"{axis}{random.uniform(-30, 30) * one:.3f}" for axis in random.sample("XYZ", random.randint(1, 3))]
         words += [f"D{random.uniform(0.5, 6) * one:.4f}"] * random.choice((0, 1, 1, 1))
         words += [f"I{random.randint(0, 90)}", f"J{random.randint(0, 90)}"]
-        words += [f"Q{random.randint(0, 9)}"] * (random.random() < 0.1)
+        words += [f"Q{random.randint(0, 9)}"] * (random.random() < 0.03)
         text = random.choice(("", "", " ")) + random.choice((" ", " ", "  ")).join(words)
         if random.random() < 0.15:
             k = text.index("P") + 2  # without P, LinuxCNC loses the tool when another one is changed
@@ -47,7 +47,7 @@ class Reading:
 
     def lines(self, blocks: int) -> list[str]:
         """Return one program, in the unit of the machine."""
-        self.label, self.known, self.g92 = 100, [f"#{k}" for k in range(100, 111)], False
+        self.label, self.known, self.g92 = 100, [f"#{k}" for k in range(100, 111)], self.random.random() < 0.3
         code = "G21" if self.unit == "mm" else "G20"
         head = self.random.choice((["%"], ["O0001"], ["%", "O0002 (part)"], []))
         lines = [f"{code} G90 G17 G94 G40 G49 G91.1 G98 S900 M3", *self._tool(), *self._away(), f"F{self._value(300)}"]
@@ -158,10 +158,18 @@ class Reading:
         return [f"{o} sub", *body, f"{o} endsub", f"{o} call [{self._number(40)}] [#10{self.random.randint(0, 9)}]"]
 
     def _offset(self) -> list[str]:
-        kinds = ["G54", "G55", "G59.3", "G92.3", "G92.2", "G92.1", f"G10 L2 P1 X{self._number(20)}", "G92"]
+        kinds = [
+            "G54",
+            "G55",
+            "G59.3",
+            "G92.3",
+            "G92.2",
+            "G92.1",
+            f"G10 L2 P1 X{self._number(20)}",
+            *(["G92"] if self.g92 else []),
+        ]
         line = self.random.choice(kinds)
         if line == "G92":
-            self.g92 = True
             line = f"G92 X{self._number(20)}"
             return [*self._away(), line, *self._away()]
         return [line, *self._away()]

@@ -32,6 +32,7 @@ ROUTES = ("auto", "plain", "interpreter")
 
 _COMMENT = 70  # characters
 _UTF8 = codecs.BOM_UTF8.decode("latin-1")
+_ASSIGNED = re.compile(r"#\s*(\d+)\s*=")
 _SUBROUTINE = re.compile(r"\s*/?\s*(?:[nN]\s*\d+\s*)?[oO]")
 
 
@@ -79,6 +80,8 @@ class Outcome:
         Moves of the new program that agree with LinuxCNC's interpreter; 0 without the check.
     digest : str
         SHA-256 of the program that was read.
+    notes : tuple of str
+        Effects of the program that the new one does not have.
     """
 
     summary: Summary
@@ -86,6 +89,7 @@ class Outcome:
     why: str
     checked: int
     digest: str
+    notes: tuple[str, ...] = ()
 
 
 def compensate(
@@ -189,7 +193,18 @@ def _written(
             )
         except ProgramError as error:
             raise ProgramError(f"the check of the new program: {error}") from error
-    return Outcome(rewriting.summary, "plain" if source is None else "interpreter", why, checked, _digest(program))
+    route = "plain" if source is None else "interpreter"
+    notes = _not_kept(source or [], offsets)
+    return Outcome(rewriting.summary, route, why, checked, _digest(program), notes)
+
+
+def _not_kept(source: list[str], offsets: Offsets) -> tuple[str, ...]:
+    """Return a note on the parameters that an expanded program sets and the control keeps."""
+    found = {int(number) for text in source for number in _ASSIGNED.findall(text)} & offsets.parameters.keys()
+    if not found:
+        return ()
+    names = ", ".join(f"#{number}" for number in sorted(found)[:10])
+    return (f"the new program does not set {names}, which the parameter file keeps for other programs",)
 
 
 def _after_end(source: list[str], end: int) -> tuple[int, int]:

@@ -184,3 +184,11 @@ def test_g28_before_any_position_is_expanded(words: str, tmp_path: Path) -> None
     assert not any("G53" in line for line in new)
     assert "G28" + "".join(f" {word[0]}0.0000" for word in words.split()) in new
     assert moves_of(new)[-1].end == (2.0, 0.0, 5.0)
+
+
+@needs_linuxcnc
+def test_parameters_that_the_control_keeps_and_the_new_program_does_not_set_are_noted(tmp_path: Path) -> None:
+    program = tmp_path / "a.ngc"
+    program.write_text("\n".join([*HEAD, "#150=3 #32=4", "G1 X[#150+#32]", "M2"]))
+    found = compensate(program, tmp_path / "b.ngc", zero, control(tmp_path), Settings())
+    assert found.notes == ("the new program does not set #150, which the parameter file keeps for other programs",)

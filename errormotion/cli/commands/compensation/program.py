@@ -105,10 +105,10 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
                 settings,
                 program=part.name,
                 uncertainty=uncertainty,
-                notes=(*offsets.notes, *found.notes),
+                notes=(*offsets.notes, *outcome.notes, *found.notes),
                 form=choice.page.form,
             )
-    _show(target, outcome, (*offsets.notes, *found.notes), expanded, time, choice, as_json)
+    _show(target, outcome, (*offsets.notes, *outcome.notes, *found.notes), expanded, time, choice, as_json)
 
 
 def _correction(sources: list[Any], choice: Choice) -> Correction:

@@ -217,9 +217,9 @@ def _refused(
             if (error := parameters.refused(line)) is not None:
                 return error
     why += " (LinuxCNC's interpreter)"
-    if len(lines) == 1:
+    if lines:
         return refusal(lines[0], source[lines[0] - 1], why)
-    return ProgramError(f"'{where.strip()[:60]}': {why}")
+    return ProgramError(why)
 
 
 def own_number(text: str) -> tuple[str, str]:

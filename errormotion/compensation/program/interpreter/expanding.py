@@ -28,7 +28,7 @@ _STATED = re.compile(r"G\s*10(?![.\d])")
 _IN_ORDER = re.compile(r"\[[^\]]*\]|#\s*<[^>]*>")  # expressions and names, which may contain the letters of axes
 _NAMES = re.compile(r"#\s*<[^>]*>")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
-_FAR = 1e5
+_FAR = 1e3
 """Largest coordinate, m; larger ones follow from a value that is unknown."""
 _WORDS = {
     "MIST_ON": "M7",

@@ -20,8 +20,8 @@ from errormotion.errors import ProgramError
 UNSTATED = -98765.4321
 """Value of the parameters that nothing states."""
 
-UNKNOWN_TOOL = 99999
-"""Number of the tool in the spindle before the program changes it."""
+UNKNOWN_TOOL = 2147400123
+"""Number of the tool in the spindle before the program changes it; no program states it."""
 
 GUARD = "Argument to acos out of range"
 """Error of the interpreter for a value that is not known."""
@@ -97,6 +97,8 @@ class Parameters:
     """
 
     def __init__(self, source: Sequence[str], offsets: Offsets) -> None:
+        if UNKNOWN_TOOL in offsets.tools:
+            raise ProgramError(f"tool {UNKNOWN_TOOL}: expected another number of a tool")
         self._source, self._offsets = source, offsets
         self._scale = "*25.4" if offsets.unit == "mm" else ""
         self._guarded: dict[int, list[str]] = {}
