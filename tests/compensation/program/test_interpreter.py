@@ -152,6 +152,10 @@ def test_a_loop_that_prints_nothing_is_ended(monkeypatch: pytest.MonkeyPatch) ->
         ["G91", "G1 X#2"],
         ["G38.2 Z-5", "G91 G1 Z#1"],
         ["G38.2 Z-5", "G10 L20 P1 Z0", "G1 Z#1"],
+        ["G0 X0 Y0", "G98 G81 X5 Y5 Z-2 R1", "G80"],
+        ["G38.2 Z-5", "G81 X5 Y5 Z-2 R1", "G80"],
+        ["G0 Z5", "G41.1 D4 G0 X30 Y30", "X60", "G40 G0 X80 Y30"],
+        ["G38.2 X5", "G41.1 D4 G0 X30 Y30", "X60", "G40 G0 X80 Y30"],
     ],
 )
 def test_an_expansion_invents_no_position(lines: list[str], tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ _IN_MACHINE = re.compile(r"G\s*(53|28|30)(?![.\d])")
 _END = re.compile(r"M\s*0*(2|30)(?![.\d])")
 _STATED = re.compile(r"G\s*10(?![.\d])")
 _IN_ORDER = re.compile(r"\[[^\]]*\]|#\s*<[^>]*>")  # expressions and names, which may contain the letters of axes
+_CYCLE = re.compile(r"G\s*(?:8[1-9]|73)(?![\d.])")
+_SIDE = re.compile(r"G\s*0*4([012])(?:\s*\.\s*1)?(?![\d.])", re.IGNORECASE)
 _NAMES = re.compile(r"#\s*<[^>]*>")
 _COMMENT = re.compile(r"\([^()]*\)|;.*")
 _FAR = 1e3
@@ -104,6 +106,7 @@ class Expansion:
         self._plane = 0
         self._numbered = 0
         self._line = 0
+        self._compensated = _compensated(source)
         self.end = 0
         self._begun = False
         self._changing = False
@@ -336,7 +339,14 @@ class Expansion:
         """
         if any(not abs(value) * self._frame.scale <= _FAR for value in new):
             raise self._refusal(command, "moves too far: the size of the tool or another value is unknown")
-        text = "" if all(self._known) else _IN_ORDER.sub(" ", self._text(command))
+        text = ""
+        if not all(self._known):
+            text = _IN_ORDER.sub(" ", self._text(command))
+            a, b, c = PLANES[self._plane]
+            if not self._known[c] and _CYCLE.search(text):
+                raise self._refusal(command, f"a canned cycle while the position of {'XYZ'[c]} is unknown")
+            if not (self._known[a] and self._known[b]) and command.line in self._compensated:
+                raise self._refusal(command, "cutter compensation that starts at an unknown position")
         words = []
         for k, axis in enumerate("XYZ"):
             if self._known[k]:
@@ -415,6 +425,18 @@ class Expansion:
         words += f" {'IJK'[a]}{x - at[a]:.4f} {'IJK'[b]}{y - at[b]:.4f}"
         words += f" P{abs(turns):.0f}" if abs(turns) > 1 else ""
         return [f"{'G3' if turns > 0 else 'G2'} {words}"]
+
+
+def _compensated(source: Iterable[str]) -> set[int]:
+    """Return the lines from one with cutter compensation (G41, G42) to the one that ends it."""
+    found: set[int] = set()
+    active = False
+    for line, text in enumerate(source, 1):
+        sides = _SIDE.findall(_COMMENT.sub(" ", text))
+        if active or any(side != "0" for side in sides):
+            found.add(line)
+        active = sides[-1] != "0" if sides else active
+    return found
 
 
 def _triple(values: Iterable[float]) -> Triple:

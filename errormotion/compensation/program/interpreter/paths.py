@@ -207,8 +207,12 @@ def _tracked(found: Iterable[Command], inch: float) -> Iterator[Cut]:
         elif name in ("SET_G5X_OFFSET", "SET_G92_OFFSET", "USE_TOOL_LENGTH_OFFSET"):
             first = 1 if name == "SET_G5X_OFFSET" else 0
             x, y, z = (value * frame.scale for value in command.numbers()[first : first + 3])
-            part = {"SET_G5X_OFFSET": "origin", "SET_G92_OFFSET": "g92", "USE_TOOL_LENGTH_OFFSET": "tool"}[name]
-            frame = replace(frame, **{part: (x, y, z)})
+            if name == "SET_G5X_OFFSET":
+                frame = replace(frame, origin=(x, y, z))
+            elif name == "SET_G92_OFFSET":
+                frame = replace(frame, g92=(x, y, z))
+            else:
+                frame = replace(frame, tool=(x, y, z))
         elif name in ("STRAIGHT_TRAVERSE", "STRAIGHT_PROBE", "STRAIGHT_FEED"):
             x, y, z = command.numbers()[:3]
             if name == "STRAIGHT_FEED":
