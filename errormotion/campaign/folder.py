@@ -16,8 +16,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from errormotion.datasets.files.reading import leaves
 from errormotion.datasets.files.runfile import SCHEMA, read_run
-from errormotion.datasets.files.writing import make_folder, replace_text, whole_folder
+from errormotion.datasets.files.writing import make_folder, replace_bytes, replace_text, whole_folder
 from errormotion.datasets.provenance import make, plain
 from errormotion.errors import RunError
 
@@ -201,7 +202,7 @@ class RunFolder:
         RunError
             It is a link to a target outside the folder.
         """
-        return self._inside("raw.zarr")
+        return self.inside("raw.zarr")
 
     @property
     def log(self) -> Path:
@@ -221,18 +222,21 @@ class RunFolder:
         if name is None or name == "":
             return None
         if isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts:
-            return self._inside(name)
+            return self.inside(name)
         raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
 
-    def _inside(self, name: str) -> Path:
-        """Return a path in this folder; RunError if a link leads out of the folder."""
+    def inside(self, name: str) -> Path:
+        """Return a path in this folder.
+
+        Raises
+        ------
+        RunError
+            A link leads out of the folder.
+        """
         path = self.path / name
-        try:
-            if path.resolve().is_relative_to(self.path.resolve()):
-                return path
-        except (OSError, RuntimeError) as error:  # a link to itself, or a name that is too long
-            raise RunError(f"{path}: cannot be followed: {error}") from error
-        raise RunError(f"{path}: expected a file in this folder; it is a link to {path.resolve()}")
+        if leaves(self.path, path):
+            raise RunError(f"{path}: expected a file in this folder; it is, or lies behind, a link to another place")
+        return path
 
     @property
     def finished(self) -> bool:
@@ -242,7 +246,7 @@ class RunFolder:
     def take_reserve(self) -> None:
         """Reserve disk space."""
         with suppress(OSError):
-            (self.path / ".reserve").write_bytes(os.urandom(RESERVE_BYTES))
+            replace_bytes(self.path / ".reserve", os.urandom(RESERVE_BYTES))
 
     def give_reserve(self) -> None:
         """Release the reserved disk space."""

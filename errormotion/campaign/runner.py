@@ -437,14 +437,15 @@ class _Session:
         self.progress.stage("identifying")
         method = test.method()
         path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
-        if (folder.path / path).exists():  # computed, but the process ended before run.json was written
-            errors = datasets.load(folder.path / path)
+        file = folder.inside(path)
+        if file.exists():  # computed, but the process ended before run.json was written
+            errors = datasets.load(file)
         else:
             with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
                 errors = noted(method.identify(raw, test.settings), raw)
             datasets.validate(errors)
-            (folder.path / path).parent.mkdir(parents=True, exist_ok=True)
-            datasets.save(errors, folder.path / path)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            datasets.save(errors, file)
         folder.step("identify", "done")
         folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
         log.info("identified", extra={"data": {"errors": path}})

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from errormotion.datasets.files.reading import leaves
 from errormotion.datasets.files.runfile import FILE
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
@@ -195,6 +196,6 @@ def _date(text: str) -> datetime | None:
 def _inside(path: Path, folder: Path) -> bool:
     """Return whether a path is a file in a folder, and no link leads out of it."""
     try:
-        return path.is_file() and path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):
+        return path.is_file() and not leaves(folder, path)
+    except (OSError, ValueError):
         return False

@@ -12,6 +12,7 @@ from typing import Any
 import xarray as xr
 
 from errormotion import plugins
+from errormotion.datasets.files.reading import leaves
 from errormotion.datasets.files.writing import whole
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
@@ -321,8 +322,9 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
     folder = Path(run_folder)
     if not folder.is_dir():
         raise RunError(f"Expected a run folder at {folder}; found none.")
-    files = sorted(folder.glob("errors/*/errors.nc"))
-    raw = load(folder / "raw.zarr") if (folder / "raw.zarr").exists() else None
+    files = [file for file in sorted(folder.glob("errors/*/errors.nc")) if not leaves(folder, file)]
+    stored = folder / "raw.zarr"
+    raw = load(stored) if stored.exists() and not leaves(folder, stored) else None
     log = raw if raw is not None and not files and _is_log(raw) else None
     if not files and log is None:
         raise RunError(f"{folder} contains no errors/*/errors.nc. Run 'errormotion identify' first.")
@@ -346,7 +348,8 @@ def belonging(errors: xr.Dataset, file: Path) -> list[xr.Dataset]:
     from errormotion.datasets import hash_dataset, load
     from errormotion.datasets.storage.disk import reading
 
-    beside = {path: load(path) for path in sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))}
+    files = sorted(file.parent.glob(f"{glob.escape(file.stem)}.*.nc"))
+    beside = {path: load(path) for path in files if not leaves(file.parent, path)}
     stated = {path: ds for path, ds in beside.items() if "errors_hash" in ds.attrs}
     own = hash_dataset(errors) if stated else ""
     found = {path: ds for path, ds in stated.items() if ds.attrs["errors_hash"] == own}

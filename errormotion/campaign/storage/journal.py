@@ -8,10 +8,11 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from pathlib import Path
 
-from errormotion.datasets.files.writing import sync
-from errormotion.errors import ErrormotionError
+from errormotion.datasets.files.writing import open_to_append, sync
+from errormotion.errors import ErrormotionError, RunError
 
 ROOT = "errormotion"
 
@@ -42,6 +43,9 @@ class JsonLines(logging.Formatter):
 class _Handler(logging.FileHandler):
     """Ignores write errors: a full disk must not end a measurement because of its log."""
 
+    def _open(self) -> TextIOWrapper:
+        return open(open_to_append(Path(self.baseFilename)), "a", encoding=self.encoding)
+
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):  # errors of opening, which the standard handler does not catch
             super().emit(record)
@@ -60,7 +64,15 @@ class _Handler(logging.FileHandler):
 
 @contextmanager
 def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
-    """Append all log records of errormotion to a file until the end of the context."""
+    """Append all log records of errormotion to a file until the end of the context.
+
+    Raises
+    ------
+    RunError
+        The file is a link.
+    """
+    if path.is_symlink():
+        raise RunError(f"{path}: is a link, and links are not written through; remove it")
     logger = logging.getLogger(ROOT)
     handler = _Handler(path, encoding="utf-8", delay=True)
     handler.setFormatter(JsonLines())

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from errormotion.datasets.files.reading import require_regular
-from errormotion.datasets.files.writing import sync
+from errormotion.datasets.files.writing import open_to_append, sync
 from errormotion.errors import RunError
 
 FILE = "events.jsonl"
@@ -91,7 +91,7 @@ def append(folder: Path, made: Event) -> Path:
     line = json.dumps({key: value for key, value in asdict(made).items() if value}, ensure_ascii=False) + "\n"
     data = line.encode()
     try:
-        with file.open("ab+") as stream, _locked(stream):
+        with open(open_to_append(file), "ab+") as stream, _locked(stream):
             size = stream.seek(0, os.SEEK_END)
             if size + len(data) + 1 > MAX_FILE:
                 raise RunError(f"{file}: the note does not fit: {size} of at most {MAX_FILE} bytes are used")

@@ -1,4 +1,4 @@
-"""Reading of files of unknown origin with limits: regular files only, and JSON of limited depth."""
+"""Reading of files of unknown origin with limits: regular files in their folder only, and JSON of limited depth."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ def require_regular(path: str | Path) -> os.stat_result:
     if not stat.S_ISREG(state.st_mode):
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
     return state
+
+
+def leaves(folder: Path, path: Path) -> bool:
+    """Return whether a path in a folder leads out of it through a link; also if it cannot be followed."""
+    try:
+        return not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # a link to itself, or a name that is too long
+        return True
 
 
 def read_bytes(path: str | Path, longest: int) -> bytes:

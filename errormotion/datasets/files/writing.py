@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -150,6 +151,29 @@ def replace_bytes(path: Path, content: bytes | memoryview, *, flush: bool = True
 def replace_text(path: Path, text: str, *, flush: bool = True) -> None:
     """Write or replace a text file (UTF-8), as `replace_all`."""
     replace_bytes(path, text.encode("utf-8"), flush=flush)
+
+
+def open_to_append(path: Path, mode: int = 0o666) -> int:
+    """Open a file to append to it, create it if it is missing, and return its descriptor.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written, or is a link, a pipe or a device: a folder of unknown origin may contain such under
+        the name of a log.
+    """
+    options = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
+    options |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # opening a pipe would wait for its reader
+    try:
+        descriptor = os.open(path, options, mode)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(error.errno, "is a link, and links are not written through", str(path)) from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
+    return descriptor
 
 
 def make_folder(path: Path) -> None:

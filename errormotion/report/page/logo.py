@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import base64
+import re
 from pathlib import Path
 
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import leaves, read_bytes
 from errormotion.datasets.files.writing import replace_bytes
 
 LARGEST = 512 << 10
@@ -15,9 +16,11 @@ NAME = "logo"
 PICTURES = {
     ".png": (b"\x89PNG\r\n", "image/png"),
     ".jpg": (b"\xff\xd8\xff", "image/jpeg"),
-    ".svg": (b"<", "image/svg+xml"),
+    ".svg": (b"", "image/svg+xml"),
 }
 """First bytes of a file by suffix, and its media type."""
+_SVG = re.compile(rb"(\xef\xbb\xbf)?(\s|<\?xml[^>]*\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)*<(\w+:)?svg[\s>]", re.DOTALL)
+"""Begin of a picture of SVG: its first element, behind a declaration and comments."""
 
 
 def mistake(path: Path) -> str:
@@ -29,7 +32,8 @@ def mistake(path: Path) -> str:
         data = read_bytes(path, LARGEST)
     except OSError as error:
         return f"{path} cannot be read: {error.strerror}"
-    return "" if _begins(data, known[0]) else f"{path} is not of type {known[1]}"
+    fits = data.startswith(known[0]) if known[0] else _SVG.match(data)
+    return "" if fits else f"{path} is not of type {known[1]}"
 
 
 def copy(path: Path, folder: Path) -> None:
@@ -42,10 +46,6 @@ def of_folder(folder: Path) -> str:
     """Return the logo of a run folder as a data URI; empty without one."""
     for suffix, (_, kind) in PICTURES.items():
         path = folder / f"{NAME}{suffix}"
-        if path.is_file() and not mistake(path):
+        if path.is_file() and not leaves(folder, path) and not mistake(path):
             return f"data:{kind};base64,{base64.b64encode(read_bytes(path, LARGEST)).decode()}"
     return ""
-
-
-def _begins(data: bytes, with_: bytes) -> bool:
-    return data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(with_)

@@ -6,6 +6,7 @@ import webbrowser
 from pathlib import Path
 
 from errormotion.cli.output import show, show_json
+from errormotion.datasets.files.reading import leaves
 from errormotion.errors import RunError
 
 PAGE = "report.html"
@@ -67,7 +68,4 @@ def _page(place: Path) -> Path:
 def _inside(folder: Path) -> Path | None:
     """Return the report of a run folder; None where there is none, or a link leads out of the folder."""
     page = folder / PAGE
-    try:
-        return page if page.is_file() and page.resolve().is_relative_to(folder.resolve()) else None
-    except (OSError, RuntimeError):
-        return None
+    return page if page.is_file() and not leaves(folder, page) else None
