@@ -40,6 +40,16 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
         [(r'(?s)\[\[test\]\]\nname = "scan".*', "")],
     ),
     "multilateration": ("virtual_tracker", "campaign.toml", [(r"count = .*", "count = [4, 3, 3]")]),
+    "linear_positioning": (
+        "virtual_positioning",
+        "campaign.toml",
+        [(r"feed = ", "runs = 3\ncount = 4\nfeed = ")],
+    ),
+    "linear_positioning, diagonals": (
+        "virtual_diagonals",
+        "campaign.toml",
+        [(r'feed = "2000', 'runs = 2\ncount = 3\nfeed = "2000')],
+    ),
     "normal_vector": (
         "virtual_probing",
         "monday.toml",

@@ -16,6 +16,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.datasets import clock
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
 from errormotion.methods.linear_positioning.acquisition.instruments import Reader, axis_reader
@@ -41,7 +42,8 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
         ``thermometer``, where the settings name sensors.
     settings : Settings
     done : Dataset, optional
-        Data of an interrupted run, which are not measured again. The instrument is then set to zero again.
+        Data of an interrupted run, which are not measured again. The instrument is then set to zero again. A virtual
+        machine that was restarted repeats them, without their data.
 
     Raises
     ------
@@ -51,11 +53,14 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     list(stops(settings))  # checks the limits before the axis moves
     axis = AxisMeasurement(bench, settings)
     along_runs = settings.cycle == "linear"
-    finished = 0 if done is None else int(done.sizes["run" if along_runs else "target"])
+    first, finished = axis.to_repeat(done, "run" if along_runs else "target")
     parts = groupby(sequence(settings), key=lambda approach: approach.run if along_runs else approach.target)
     for number, part in parts:
+        if number < first:
+            continue
+        measured = axis.measure(list(part), along_runs)
         if number >= finished:
-            yield axis.measure(list(part), along_runs)
+            yield measured
 
 
 class Motion:
@@ -69,6 +74,21 @@ class Motion:
                 "Expected an instrument of kind 'controller' that can move the axis to a position (move_to); the bench "
                 "has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
             )
+
+        self.origin: float | None = None
+        """Time of a simulated control at the start of the measurement, s; None before it, and for a real one."""
+
+    def to_repeat(self, done: xr.Dataset | None, dim: str) -> tuple[int, int]:
+        """Return the number of the first part to measure, and of the first one to yield, along a dimension.
+
+        A virtual machine that was restarted repeats the parts of an interrupted test, so that the others are those of
+        a test without interruption: its errors and its noise depend on what was done before.
+        """
+        finished = 0 if done is None else int(done.sizes[dim])
+        if hasattr(self.control, "elapse"):
+            self.origin = float(self.control.state()["time"])
+        repeats = done is not None and self.origin is not None and clock.restarted(done, self.origin)
+        return (0 if repeats else finished), finished
 
     def move_to(self, position: Array, feed: float | None = None) -> None:
         """Move to a position (3,), m, at the feed of the approaches or another, and wait until the axes have arrived.
@@ -200,16 +220,17 @@ class AxisMeasurement(Motion):
         if self.sensors:
             variables["temperature"] = (*temperatures, {"units": "degC"})
             coords["sensor"] = list(self.sensors)
-        attrs = {"schema": SCHEMA, "axis": settings.axis, **measured_attrs(self.bench, self.reader, x, start)}
+        attrs = {"schema": SCHEMA, "axis": settings.axis, **measured_attrs(self, self.reader, x, start)}
         return xr.Dataset(variables, coords, attrs)
 
 
-def measured_attrs(bench: Bench, reader: Reader, x: Array, start: str) -> dict[str, Any]:
+def measured_attrs(motion: Motion, reader: Reader, x: Array, start: str) -> dict[str, Any]:
     """Return the attributes that state where, when and how readings ``x`` were taken, and how many are missing."""
     missing = int(np.isnan(x).sum())
     return {
-        "machine": bench.machine,
+        "machine": motion.bench.machine,
         "instrument": reader.id,
+        **({} if motion.origin is None else {clock.ORIGIN: motion.origin}),
         "start": start,
         "dropped": 0,
         "invalid": {"beam broken": missing} if missing else {},

@@ -33,7 +33,8 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
         With a ``controller`` (``move_to``, ``state``) and an ``interferometer`` or a ``laser_tracker`` in line.
     settings : Settings
     done : Dataset, optional
-        Diagonals of an interrupted run, which are not measured again.
+        Diagonals of an interrupted run, which are not measured again. A virtual machine that was restarted repeats
+        them, without their data.
 
     Raises
     ------
@@ -42,9 +43,12 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
     """
     motion = Motion(bench, settings)
     readers = readers_of(bench, settings)
-    finished = 0 if done is None else int(done.sizes["diagonal"])
+    first_measured, finished = motion.to_repeat(done, "diagonal")
     for k, (line, stops, reader) in enumerate(zip(lines(settings), distances(settings), readers, strict=True)):
+        if k < first_measured:
+            continue
         if k < finished:
+            _measure(motion, line, stops, reader)
             continue
         first, last = (
             " ".join(f"{a}{v * 1e3:.3f}" for a, v in zip("XYZ", line.point(s), strict=True)) for s in stops[[0, -1]]
@@ -91,4 +95,4 @@ def _measure(motion: Motion, line: Line, stops: Array, reader: Reader) -> xr.Dat
     coords: dict[str, Any] = {"diagonal": [line.name], "approach": list(APPROACHES), "direction": list("xyz")}
     if settings.functional_point is not None:
         variables["functional_point"] = ("direction", np.array(settings.functional_point), _M)
-    return xr.Dataset(variables, coords, {"schema": SCHEMA, **measured_attrs(motion.bench, reader, x, start)})
+    return xr.Dataset(variables, coords, {"schema": SCHEMA, **measured_attrs(motion, reader, x, start)})
