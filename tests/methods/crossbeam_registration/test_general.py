@@ -18,22 +18,56 @@ def _open3d():
     needed_open3d.open3d()
 
 
-def sphere(rng):
-    v = rng.normal(size=(POINTS, 3))
+def sphere(rng, points=POINTS):
+    v = rng.normal(size=(points, 3))
     return RADIUS * v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-def pebble(rng):
+def pebble(rng, points=POINTS):
     """A closed surface with bumps: whatever the direction, two points lie behind one another."""
-    v = sphere(rng) / RADIUS
+    v = sphere(rng, points) / RADIUS
     radius = RADIUS * (1 + 0.15 * np.sin(6 * v[:, 0]) + 0.1 * np.cos(4 * v[:, 1] + 3 * v[:, 2]))
     return radius[:, None] * v * [1.0, 1.3, 0.8]
 
 
-def pair(shape, seed):
+def square(rng, points, half=4e-3):
+    return rng.uniform(-half, half, (2, points))
+
+
+def waves(rng, points):
+    x, y = square(rng, points)
+    return np.column_stack([x, y, 1e-3 * np.sin(600 * x + 100 * y) + 1e-3 * np.cos(500 * y - 80 * x)])
+
+
+def plane(rng, points):
+    x, y = square(rng, points)
+    return np.column_stack([x, y, 0.2 * x])
+
+
+def ridges(rng, points):
+    x, y = square(rng, points)
+    return np.column_stack([x, y, 0.5e-3 * np.sin(1500 * x)])
+
+
+def cap(rng, points):
+    x, y = square(rng, points, 2e-3)
+    return np.column_stack([x, y, np.sqrt(25e-6 - x**2 - y**2)])
+
+
+def cylinder(rng, points):
+    angle, y = rng.uniform(0, 2 * np.pi, points), rng.uniform(-4e-3, 4e-3, points)
+    return np.column_stack([RADIUS * np.cos(angle), y, RADIUS * np.sin(angle)])
+
+
+def cone(rng, points):
+    angle, height = rng.uniform(0, 2 * np.pi, points), rng.uniform(1e-3, 5e-3, points)
+    return np.column_stack([height * np.cos(angle), height * np.sin(angle), height])
+
+
+def pair(shape, seed, points=POINTS, noise=NOISE):
     rng = np.random.default_rng(seed)
-    both = shape(rng), poses.displaced(TWIST).inv().apply(shape(rng))
-    return [cloud + rng.normal(0, NOISE, cloud.shape) for cloud in both]
+    both = shape(rng, points), poses.displaced(TWIST).inv().apply(shape(rng, points))
+    return [cloud + rng.normal(0, noise, cloud.shape) for cloud in both]
 
 
 @pytest.mark.slow
@@ -65,3 +99,54 @@ def test_the_result_holds_at_any_point():
 def test_a_ball_has_no_rotation():
     with pytest.raises(MethodError, match="undetermined: EA, EB, EC"):
         register_clouds(*pair(sphere, 0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.2e-6, 10e-6])
+@pytest.mark.parametrize("points", [600, 1500, 4000])
+@pytest.mark.parametrize("shape", [pebble, waves])
+def test_the_covariance_holds_at_any_density(shape, points, noise):
+    squares = []
+    for seed in range(8):
+        found = register_clouds(*pair(shape, seed, points, noise), point=np.zeros(3))
+        error = found.twist - TWIST
+        squares.append(error @ np.linalg.solve(found.covariance, error) / 6)
+    # The mean of 8 values of chi2(6) / 6 scatters by sqrt(2 / 6 / 8) = 0.2; three of it.
+    assert np.mean(squares) < 1.6
+
+
+@pytest.mark.parametrize(
+    ("shape", "loose"),
+    [
+        (plane, "EX, EY, EC"),
+        (cap, "EX, EY, EC"),
+        (sphere, "EA, EB, EC"),
+        (cylinder, "EY, EB"),
+        (ridges, "EY"),
+        (cone, "EC"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+@pytest.mark.parametrize("points", [600, 1500, 4000])
+@pytest.mark.parametrize("noise", [0.2e-6, 2e-6])
+def test_freedoms_that_a_shape_leaves_undetermined_are_named_at_any_density(shape, loose, points, noise):
+    for seed in range(3):
+        with pytest.raises(MethodError, match=f"undetermined: {loose} "):
+            register_clouds(*pair(shape, seed, points, noise))
+
+
+@pytest.mark.parametrize("shape", [pebble, waves, plane, sphere, cylinder])
+@pytest.mark.parametrize("points", [100, 130, 200, 300])
+def test_few_points_give_a_result_that_holds_or_are_refused(shape, points):
+    for seed in range(6):
+        try:
+            found = register_clouds(*pair(shape, seed, points), point=np.zeros(3))
+        except MethodError as refusal:
+            said = str(refusal)
+        else:
+            # chi2(6) exceeds 33 once in 100 000
+            error = found.twist - TWIST
+            assert error @ np.linalg.solve(found.covariance, error) < 33
+            assert shape in (pebble, waves)
+            continue
+        assert "undetermined" in said or "within 0.3 mm" in said

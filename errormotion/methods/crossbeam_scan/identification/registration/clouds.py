@@ -8,10 +8,12 @@ distributions transform before point-to-point ICP (Zhao et al., section 3.2).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
@@ -28,6 +30,10 @@ CELL = 1e-3
 """Edge of the cells of the normal distributions transform, m."""
 _NORMAL_RADIUS = 0.25e-3
 _NEIGHBOURS = 30
+MIN_NEIGHBOURS = 12
+"""Smallest number of points of a plane, those beyond 0.25 mm included."""
+_AT_ONCE = 20_000
+"""Points whose neighbours are in memory at once."""
 _ICP_STEPS = 60
 
 
@@ -81,17 +87,42 @@ def plane_icp(cold: ArrayLike, warm: ArrayLike) -> Found:
     return _icp(o3d, source, target, np.eye(4), method)
 
 
-def normals(points: ArrayLike) -> tuple[Array, float]:
-    """Return the unit normals (n, 3) of a cloud, of either sign, from neighbours within 0.25 mm, and their variance.
+@dataclass(frozen=True)
+class Normals:
+    """Normals of a cloud's points, from the points around them.
 
-    The variance of a normal's tilt about one direction is that of its neighbours about their plane over their spread
-    and number; curvature counts as noise in it, and it does tilt the plane where neighbours are unevenly spread.
+    Attributes
+    ----------
+    vectors : ndarray (n, 3)
+        Unit normals, of either sign.
+    tilt : ndarray (n,)
+        Variance of a normal's tilt about one direction, rad^2.
     """
-    cloud = _cloud(open3d(), points)
-    cloud.estimate_covariances(open3d().geometry.KDTreeSearchParamHybrid(_NORMAL_RADIUS, _NEIGHBOURS))
-    values, vectors = np.linalg.eigh(np.asarray(cloud.covariances))
-    tilt = np.median(values[:, 0] / np.maximum(values[:, 1], np.finfo(float).tiny)) / _NEIGHBOURS
-    return vectors[:, :, 0], float(tilt)
+
+    vectors: Array
+    tilt: Array
+
+
+def normals(points: Array) -> Normals:
+    """Return the normals of a cloud (n, 3), m, from planes through the points around: within 0.25 mm, and 12 at least.
+
+    The tilt of a plane through m points is that of their scatter about it over their spread and m - 3. Curvature counts
+    as scatter, and it does tilt the plane where the points around are unevenly spread.
+    """
+    tree = cKDTree(points)
+    vectors, tilt = np.empty(points.shape), np.empty(len(points))
+    for first in range(0, len(points), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        distance, near = tree.query(points[part], _NEIGHBOURS)
+        there = (distance <= _NORMAL_RADIUS) | (np.arange(_NEIGHBOURS) < MIN_NEIGHBOURS)
+        m = there.sum(axis=1)
+        around = np.where(there[..., None], points[near] - points[part, None], 0.0)
+        middle = around.sum(axis=1) / m[:, None]
+        spread = np.einsum("nki,nkj->nij", around, around) / m[:, None, None] - middle[:, :, None] * middle[:, None]
+        values, axes = np.linalg.eigh(spread)
+        vectors[part] = axes[:, :, 0]
+        tilt[part] = np.maximum(values[:, 0], 0.0) / np.maximum(values[:, 1], np.finfo(float).tiny) / (m - 3)
+    return Normals(vectors, tilt)
 
 
 def published_chain(cold: ArrayLike, warm: ArrayLike) -> Found:
