@@ -22,6 +22,7 @@ from errormotion.methods.crossbeam_scan.identification.carriage import Rig
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
+from errormotion.methods.crossbeam_scan.identification.registration.extra import BASES
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:
@@ -107,16 +108,21 @@ def registration_covariance(settings: Settings) -> Array:
     Q = np.stack([X, Y, z], axis=-1)
     J = np.concatenate([n, np.cross(Q, n), n * Q[..., 1:2]], axis=-1)
     used = 6 if settings.strain == "rigid" else 9
-    J = J[..., :used]
+    strains = settings.strains()
+    stretched = [np.einsum("lpi,ij,lpj->lp", n, BASES[name], Q) for name in strains]
+    J = np.stack([*np.moveaxis(J[..., :used], -1, 0), *stretched], axis=-1)
     own = np.stack([np.ones_like(z), zy], axis=-1)
     weight = layout.points / _CELLS / (2 * settings.height_noise**2)
     A, B, C = (weight * np.einsum("lpi,lpj->lij", left, right) for left, right in ((J, J), (J, own), (own, own)))
     jitter = np.diag(2 * np.array([layout.jitter_z, layout.jitter_y]) ** 2 + 1e-24)
     inside = np.linalg.solve(np.linalg.inv(jitter) + C, np.swapaxes(B, 1, 2))
     information = np.sum(A - B @ inside, axis=0) * lines / y.size
+    priors = range(used, J.shape[-1])
+    information[priors, priors] += np.array([value**-2 for value in strains.values()])
     scale = 1 / np.sqrt(np.diag(information))
     out = np.zeros((9, 9))
-    out[:used, :used] = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    joint = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    out[:used, :used] = joint[:used, :used]
     return out
 
 
@@ -147,6 +153,8 @@ def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
             f"spindle (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
         )
     covariance = (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
+    edge = calibration.EDGE_UNCERTAINTY
+    covariance += np.diag([0.0, 0.0, edge / settings.pocket_radius, edge, edge, 0.0]) ** 2
     at_profiler = pose_twists(nominal, -nominal.translation)
     return build_errors(
         np.zeros((1, 6)),

@@ -54,10 +54,10 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
         sources["profiler pose"] = _pose(rig)
     if rig.lever_uncertainty.any():
         sources["lever"] = _lever(rig)
-    if settings.scale_uncertainty > 0:
-        sources["scale of the profiler"] = _strain(settings.scale_uncertainty, together=False)
-    if settings.expansion_uncertainty > 0:
-        sources["expansion of the artefacts"] = _strain(settings.expansion_uncertainty, together=True)
+    strains = settings.strains()
+    for name, parameter in (("scale of the profiler", "scale_x"), ("expansion of the artefacts", "expansion")):
+        if parameter in strains:
+            sources[name] = _strain(strains[parameter], together=parameter == "expansion")
     return Redrawing(reduced, settings.model_copy(update={"moved": "keep"}), sources)
 
 

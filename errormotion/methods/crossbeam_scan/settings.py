@@ -11,6 +11,9 @@ from errormotion.datasets.units import Angle, Length, Time, Velocity
 from errormotion.plugins import PluginSettings
 
 MINUTE = 60.0
+STRAIN = 20e-6
+"""Standard uncertainty of a scale or expansion that is not stated, m/m: of a steel artefact, 2 K; of a profiler, a
+fifth of 0.01 % per kelvin, as data sheets state, at 1 K."""
 
 
 class PoseSettings(PluginSettings):
@@ -116,11 +119,17 @@ class Settings(PluginSettings):
     guide_uncertainty: Angle = Field(
         default=1e-6, gt=0, description="standard uncertainty of pitch and yaw relative to the slopes of the guide"
     )
-    scale_uncertainty: float = Field(
-        default=0.0, ge=0, description="relative standard uncertainty of the profiler's scale between cold and warm"
+    scale_uncertainty: float | None = Field(
+        default=None,
+        ge=0,
+        description="relative standard uncertainty of the profiler's scales between cold and warm; default: 20 um/m, "
+        "with a note",
     )
-    expansion_uncertainty: float = Field(
-        default=0.0, ge=0, description="relative standard uncertainty of the artefacts' expansion between cold and warm"
+    expansion_uncertainty: float | None = Field(
+        default=None,
+        ge=0,
+        description="relative standard uncertainty of the artefacts' expansion between cold and warm; default: "
+        "20 um/m, with a note",
     )
     moved: Literal["exclude", "keep"] = Field(
         default="exclude", description="treatment of the errors of an artefact that has moved"
@@ -132,6 +141,14 @@ class Settings(PluginSettings):
 
     # Planning
     layout: Layout = Field(default_factory=Layout, description="artefacts and profiler that a plan assumes")
+
+    def strains(self) -> dict[str, float]:
+        """Return the standard uncertainty, m/m, of each scale and expansion that is not exact, by its parameter."""
+        scale, expansion = (
+            STRAIN if value is None else value for value in (self.scale_uncertainty, self.expansion_uncertainty)
+        )
+        known = {"scale_x": scale, "scale_z": scale, "expansion": expansion}
+        return {name: value for name, value in known.items() if value > 0}
 
     @model_validator(mode="after")
     def _fits(self) -> Settings:

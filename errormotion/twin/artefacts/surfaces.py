@@ -24,7 +24,9 @@ PARAMETERS = 5
 #: Newton's iteration on a ray: largest last step, m, and largest number of steps.
 STEP, STEPS = 1e-13, 20
 
-_ROOT_2 = math.sqrt(2.0)
+_ROOT_2, _ROOT_2_PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
+_NO_WALL = 1e-6
+"""Width of a wall in the picture, relative to the spot, below which it is not seen."""
 _GOLDEN, _S11 = np.uint64(0x9E3779B97F4A7C15), np.uint64(11)
 
 
@@ -97,16 +99,34 @@ def edge_distance(shape: int, p: Array, x: float, y: float) -> float:
 
 
 @compiled
-def _pocket(p: Array, pose: Array, x: float) -> tuple[float, float, float]:
+def _positive_part(mean: float, spread: float) -> float:
+    """Return the mean of max(0, X) of a normal X."""
+    u = mean / spread
+    return mean * 0.5 * (1.0 + math.erf(u / _ROOT_2)) + spread * math.exp(-0.5 * u * u) / _ROOT_2_PI
+
+
+@compiled
+def _pocket(p: Array, pose: Array, x: float, steepest: float) -> tuple[float, float, float]:
     """Return the point of a ray on a pocket: z in the profiler's frame, and x, y at the rim in the artefact's frame.
 
-    At the rim, the reading is the mean of both levels, weighted by the shares of the spot.
+    A ray that is tilted to the outside on its way down ends on the wall, where it meets it above the floor; on the
+    other side of the pocket the plate hides the wall. At the edges, the reading is the mean over the spot. z is NaN
+    in the middle of the wall, if it is steeper than ``steepest`` in the profiler's frame.
     """
     z = -(pose[2, 3] + pose[2, 0] * x) / pose[2, 2]
     qx = pose[0, 0] * x + pose[0, 2] * z + pose[0, 3]
     qy = pose[1, 0] * x + pose[1, 2] * z + pose[1, 3]
-    share = 0.5 * (1.0 + math.erf((p[2] - math.hypot(qx, qy)) / (p[4] * _ROOT_2)))
-    return z - share * p[3] / pose[2, 2], qx, qy
+    radius = math.hypot(qx, qy)
+    inside = p[2] - radius
+    outwards = -(pose[0, 2] * qx + pose[1, 2] * qy) / (pose[2, 2] * max(radius, p[4]))  # per depth of the ray
+    wall = outwards * p[3]
+    if wall <= _NO_WALL * p[4]:
+        depth = p[3] * 0.5 * (1.0 + math.erf(inside / (p[4] * _ROOT_2)))
+        return z - depth / pose[2, 2], qx, qy
+    if 0.0 < inside < wall and outwards * steepest < 1.0:
+        return math.nan, qx, qy
+    depth = (_positive_part(inside, p[4]) - _positive_part(inside - wall, p[4])) / outwards
+    return z - depth / pose[2, 2], qx, qy
 
 
 @compiled
@@ -131,7 +151,7 @@ def profile(
         out[i] = math.nan
         edge[i] = -1.0
         if shape == POCKET:
-            height, qx, qy = _pocket(p, pose, x[i])
+            height, qx, qy = _pocket(p, pose, x[i], steepest)
             edge[i] = edge_distance(shape, p, qx, qy)
             if edge[i] >= 0.0:
                 out[i] = height

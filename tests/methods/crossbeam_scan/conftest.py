@@ -21,11 +21,11 @@ def gantry():
 def scan_pocket(gantry):
     """Return x, heights and stage of scans of the pocket at heights of the spindle."""
 
-    def scan(seed, disturbances=None, *, lifts=(0.166, 0.182), lines=80, points=3200):
+    def scan(seed, disturbances=None, *, lifts=(0.166, 0.182), lines=80, points=3200, machine=gantry):
         disturbances = Disturbances() if disturbances is None else disturbances
         profiler = Profiler(points, 40e-3 / points, disturbances=disturbances)
         feed = 28e-3 / lines
-        raw = simulation.raw_pocket(gantry, seed=seed, lifts=lifts, profiler=profiler, profiles=lines, feed=feed)
+        raw = simulation.raw_pocket(machine, seed=seed, lifts=lifts, profiler=profiler, profiles=lines, feed=feed)
         return raw["x"].values, raw["height"].values.astype(float), raw["stage"].values
 
     return scan

@@ -61,8 +61,12 @@ def replaced(raw, machine, cycles, artefact, step):
     return out
 
 
+EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0}
+"""The twin's artefacts do not expand, and its profiler keeps its scale."""
+
+
 def identify(raw, **settings):
-    return CrossbeamScan().identify(raw, Settings(**settings))
+    return CrossbeamScan().identify(raw, Settings(**EXACT, **settings))
 
 
 def named(ds, what="moved before"):

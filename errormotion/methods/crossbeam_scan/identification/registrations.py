@@ -209,10 +209,7 @@ def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registratio
     if settings.registration == "height_map":
         if settings.strain != "rigid":
             extra |= dict.fromkeys(FEED, DRIFT)
-        if settings.scale_uncertainty > 0:
-            extra |= dict.fromkeys(("scale_x", "scale_z"), settings.scale_uncertainty)
-        if settings.expansion_uncertainty > 0:
-            extra["expansion"] = settings.expansion_uncertainty
+        extra |= settings.strains()
     return register(
         cold, warm, registration=settings.registration, point=np.zeros(3), line_effects=settings.line_effects,
         extra=extra,

@@ -22,6 +22,7 @@ from errormotion.methods.crossbeam_scan.identification.chain import SOURCES, pos
 from errormotion.methods.crossbeam_scan.identification.curves import curves
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registrations import Maps, Registrations, register_all
+from errormotion.methods.crossbeam_scan.settings import STRAIN
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
@@ -137,7 +138,7 @@ def _dataset(
         excluded = check.wrong[rows]
         values[excluded], own[excluded], influence[:, excluded] = np.nan, np.nan, np.nan
         reason[excluded] = MOVED
-    notes = [*_notes(reason, position, rig), *check.notes, *corrected]
+    notes = [*_notes(reason, position, rig), *_strain_notes(settings), *check.notes, *corrected]
     notes += found.notes
     if settings.strain == "free":
         notes += _pitch_note(own)
@@ -219,6 +220,26 @@ def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
     if name is None or raw.sizes["cycle"] < cycles:
         return None
     return np.asarray(raw[name].values, dtype=float)
+
+
+def _strain_notes(settings: Settings) -> list[str]:
+    """Return notes on scale and expansion that are assumed, or not contained in the uncertainty."""
+    stated = {
+        "the scales of the profiler": settings.scale_uncertainty,
+        "the expansion of the artefacts": settings.expansion_uncertainty,
+    }
+    names = " and ".join(name for name, value in stated.items() if value is None)
+    if settings.registration != "height_map":
+        return [
+            "The uncertainty does not contain scale and expansion between cold and warm, which this registration does "
+            "not estimate: 20 um/m of each are usual."
+        ]
+    if not names:
+        return []
+    return [
+        f"No uncertainty is stated of {names} between cold and warm (scale_uncertainty, expansion_uncertainty): "
+        f"{STRAIN * 1e6:g} um/m is assumed, the standard uncertainty."
+    ]
 
 
 def _notes(reason: NDArray[np.object_], position: Array, rig: Rig) -> list[str]:

@@ -9,6 +9,13 @@ and the plate provides the tilt dz/dx. The feed s is along Y of the machine, not
 circle is sheared in (x, s), not rotated. With s in the profiler's frame, as in eq. (7) of Zhao et al., it would be a
 rotated circle, from which g cannot be separated from the position of the centre. For the same reason, a is determined
 only when the plate is scanned at two heights.
+
+The line of sight is tilted to the axis of the pocket: from the rim to the floor, at depth d, it moves by
+t = -d (H_xz, H_yz) / H_zz. Where it moves outwards, along the normal n of the rim, it ends on the wall, which is then
+between plate and floor in the picture, w = t.n wide. The edge that `edges` finds lies on the wall, at the share k of
+its width: at the radius r - k w. k depends on what the sensor makes of a wall: 1/2 if it sees all or nothing of it. It
+is a parameter of the fit, with a uniform distribution from 0 to 1 as its prior. Without it, the picture of the rim
+would be deformed on one side only, which is in part a shear like that by g.
 """
 
 from __future__ import annotations
@@ -39,7 +46,14 @@ CLIP = 10.0
 #: Standard uncertainty beyond which a parameter is not determined: rad, m.
 WORST_ANGLE, WORST_POSITION = 0.05, 2e-3
 
-_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 1e-5])
+#: Standard uncertainty of the position of edges that oblique lines across a spot leave, common to all of them, m.
+EDGE_UNCERTAINTY = 10e-9
+#: Expected share of the wall between rim and edge, and its standard uncertainty.
+WALL_SHARE, WALL_UNCERTAINTY = 0.5, 12**-0.5
+
+_STEP = 1e-5
+"""Change of the line of sight for numerical derivatives."""
+_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 1e-5, 1e-1])
 
 
 def pose(a: ArrayLike, b: ArrayLike, g: ArrayLike, dx: ArrayLike, dy: ArrayLike, dz: ArrayLike) -> RigidTransform:
@@ -187,6 +201,7 @@ class _Scan:
     level_u: float
     lift: float
     tilt: Tilt
+    depth: float  # of the pocket, m
 
 
 def _scan(x: Array, height: Array, stage: Array) -> _Scan:
@@ -196,7 +211,13 @@ def _scan(x: Array, height: Array, stage: Array) -> _Scan:
     z = heights.mean() + plate.slope * rim.x
     positions = np.stack([rim.x, np.zeros_like(z), z], axis=-1)
     level, level_u = float(heights.mean()), float(heights.std(ddof=1) / np.sqrt(heights.size))
-    return _Scan(positions, stage[rim.line], level, level_u, float(stage[0, 2]), plate)
+    return _Scan(positions, stage[rim.line], level, level_u, float(stage[0, 2]), plate, rim.depth)
+
+
+def _sight(p: Array) -> Array:
+    """Return the motion (2,) of the line of sight across the axis of the pocket, for each metre of depth."""
+    R = pose(*p[:6]).rotation.as_matrix()
+    return np.asarray(-R[:2, 2] / R[2, 2])
 
 
 class _Fit:
@@ -210,7 +231,9 @@ class _Fit:
         self.edges = np.concatenate([scan.edges for scan in scans])
         self.centre = np.array(pocket.centre, dtype=float)
         self.shift = np.concatenate([scan.stage for scan in scans])[:, None] - self.centre
+        self.depth = np.concatenate([np.full((len(scan.edges), 1), scan.depth) for scan in scans])
         self.size_x = self.size_y = 2e-6
+        self.sight = np.zeros(2)  # motion of the line of sight across, for each metre of depth
 
     def solve(self) -> ProfilerPose:
         """Return the fit, its weights from its own residuals."""
@@ -222,17 +245,20 @@ class _Fit:
         for _ in range(4):
             if (lines := int(used.sum())) < _MIN_LINES:
                 raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
+            self.sight = _sight(p)
             solution = least_squares(self._residuals, p / _UNIT, jac=self._jacobian, args=(used,), method="lm")
             p, fitted = solution.x * _UNIT, used
             used = self._weigh(p, used)
         lines = int(fitted.sum())
-        covariance = self._covariance(np.array(solution.jac), np.array(solution.fun), 2 * lines)
+        fun, jac = np.array(solution.fun), np.array(solution.jac)
+        covariance = self._covariance(jac, fun, 2 * lines, self._through_sight(solution.x, fitted, fun, jac))
+        covariance += np.diag([0.0, 0.0, EDGE_UNCERTAINTY / p[6], EDGE_UNCERTAINTY, EDGE_UNCERTAINTY, 0.0]) ** 2
         return ProfilerPose(p[:6], covariance, float(p[6]), self.size_x, self.size_y, lines)
 
     def _start(self) -> Array:
         middle = (self.edges.mean(axis=1) + self.shift[:, 0]).mean(axis=0)
         b = np.mean([-np.arctan(scan.tilt.slope) for scan in self.scans])
-        return np.array([0.0, b, 0.0, *-middle, self.pocket.radius])
+        return np.array([0.0, b, 0.0, *-middle, self.pocket.radius, WALL_SHARE])
 
     def _rim(self, p: Array, H: RigidTransform) -> tuple[Array, Array, Array, Array]:
         """Return half sum and half difference of the radii less r, m, and |cos|, |sin| of the edges, (..., n) each."""
@@ -242,20 +268,25 @@ class _Fit:
             for k in (0, 1)
         )
         radius = np.hypot(X, Y)
+        outwards = (self.sight[0] * X + self.sight[1] * Y) / radius
+        of_rim = radius + p[..., 7, None, None] * np.maximum(self.depth * outwards, 0.0)
         (left, right), (cos, other_cos), (sin, other_sin) = (
-            np.moveaxis(values, -1, 0) for values in (radius, np.abs(X / radius), Y / radius)
+            np.moveaxis(values, -1, 0) for values in (of_rim, np.abs(X / radius), Y / radius)
         )
         half_sum = (left + right) / 2 - p[..., 6, None]
         return half_sum, (right - left) / 2, np.minimum(cos, other_cos), np.abs((sin + other_sin) / 2)
 
     def _residuals(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
-        """Return all residuals (..., n) divided by their standard deviations, for scaled parameters (..., 7)."""
+        """Return all residuals (..., n) divided by their standard deviations, for scaled parameters (..., 8)."""
         p = scaled * _UNIT
         H = pose(*np.moveaxis(p[..., :6], -1, 0))
         half_sum, half_difference, cos, sin = self._rim(p, H)
         size = cos * self.size_x / np.sqrt(2)
         rows = [(half_sum / np.hypot(size, sin * self.size_y))[..., used], (half_difference / size)[..., used]]
-        misses = [(p[..., 6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9)]
+        misses = [
+            (p[..., 6] - self.pocket.radius) / max(self.pocket.radius_uncertainty, 1e-9),
+            (p[..., 7] - WALL_SHARE) / WALL_UNCERTAINTY,
+        ]
         R = H.rotation.as_matrix()
         for scan in self.scans:
             Z = R[..., 2, 2] * scan.level + p[..., 5] + scan.lift - self.centre[2]  # at x = 0
@@ -267,11 +298,28 @@ class _Fit:
         return np.concatenate(rows, axis=-1)
 
     def _jacobian(self, scaled: Array, used: NDArray[np.bool_]) -> Array:
-        """Return the derivatives (n, 7) of the residuals: differences for all parameters at once."""
+        """Return the derivatives (n, 8) of the residuals: differences for all parameters at once."""
         step = np.copysign(np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(scaled), 1.0), scaled)
         ends = scaled + np.diag(step)
         here, *there = self._residuals(np.stack([scaled, *ends]), used)
         return np.asarray((np.stack(there) - here).T / (np.diag(ends) - scaled))
+
+    def _through_sight(self, scaled: Array, used: NDArray[np.bool_], fun: Array, J: Array) -> Array:
+        """Return the change (8, 8) of the scaled parameters with that of a fit at a given line of sight.
+
+        The wall determines no angle: a sensor may see it otherwise. An error of the angles, however, changes the width
+        of the wall, and thereby the other parameters and the angles again.
+        """
+        by_sight = np.empty((len(fun), 2))
+        kept = self.sight
+        for k, step in enumerate(_STEP * np.eye(2)):
+            self.sight = kept + step
+            by_sight[:, k] = (self._residuals(scaled, used) - fun) / _STEP
+        self.sight = kept
+        by_angle = np.zeros((2, len(scaled)))
+        by_angle[0, 1], by_angle[1, 0] = -_UNIT[1], _UNIT[0]  # of the sight, small angles
+        fed_back = -np.linalg.lstsq(J, by_sight, rcond=None)[0] @ by_angle
+        return np.asarray(np.linalg.inv(np.eye(len(scaled)) - fed_back))
 
     def _weigh(self, p: Array, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Estimate both scatters from the residuals; return the lines within `CLIP`."""
@@ -287,7 +335,7 @@ class _Fit:
         self.size_y = float(np.sqrt(max(along[fits].sum() / np.sum(sin[fits] ** 4), 1e-18)))
         return np.asarray(fits)
 
-    def _covariance(self, J: Array, misses: Array, edges_end: int) -> Array:
+    def _covariance(self, J: Array, misses: Array, edges_end: int, through_sight: Array) -> Array:
         """Return the covariance (6, 6) of the pose; raise MethodError where it is not determined.
 
         The first ``edges_end`` residuals are those of the edges. Their scatter depends on how obliquely a line crosses
@@ -297,7 +345,7 @@ class _Fit:
         inverse = V.T / np.maximum(s, 1e-12 * s[0])
         squares = np.ones(misses.size)
         squares[:edges_end] = misses[:edges_end] ** 2 * edges_end / (edges_end - _UNIT.size)
-        gain = (inverse @ inverse.T) @ J.T
+        gain = through_sight @ (inverse @ inverse.T) @ J.T
         covariance = np.asarray((gain * squares) @ gain.T * np.outer(_UNIT, _UNIT))[:6, :6]
         size = np.sqrt(np.diag(covariance))
         worst = np.repeat([WORST_ANGLE, WORST_POSITION], 3)

@@ -2,7 +2,8 @@
 
 An edge is determined to a fraction of the point pitch from the area under the step: with the height g normalised to 0
 (floor) and 1 (plate), the distance of a falling edge from the start of a window is the sum of g times the pitch. This
-is true for any symmetrical spot at any sampling phase.
+is true for any symmetrical spot at any sampling phase. Where the line of sight is tilted, the wall of the pocket is in
+the picture on one side, as a slope between plate and floor or without readings: the edge is then somewhere on it.
 """
 
 from __future__ import annotations
@@ -54,11 +55,14 @@ class Edges:
         Left and right edge, m.
     z : ndarray, (n, 2)
         Height of the plate there, m.
+    depth : float
+        Of the floor below the plate, m.
     """
 
     line: NDArray[np.int64]
     x: Array
     z: Array
+    depth: float
 
 
 def tilt(x: Array, height: Array) -> Tilt:
@@ -143,7 +147,9 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
             f"Expected ten lines with both edges of the pocket; found {line.size}. Too many readings are missing at "
             "the edges, or the pocket is not completely in the scan."
         )
-    return plate, Edges(line, at, plate.height[line, None] + plate.slope * at)
+    floor = (index > first[lines, None] + trim) & (index < last[lines, None] - trim)
+    depth = -float(np.nanmedian(np.where(floor, step, np.nan)))
+    return plate, Edges(line, at, plate.height[line, None] + plate.slope * at, depth)
 
 
 def _spans(deep: Mask) -> Mask:
