@@ -1,18 +1,23 @@
 """The check of a new program: the interpreter reads the original with the files of the machine as they are."""
 
 import os
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
+from nc_controls import Reading, control
 from nc_paths import ORIGINS, field, rewritten
 from nc_programs import Programs
 
 from errormotion.compensation.program.compensating import Settings, compensate
 from errormotion.compensation.program.interpreter import canonical, paths
+from errormotion.compensation.program.interpreter.agreement import check
+from errormotion.compensation.program.interpreter.expanding import Expansion
 from errormotion.compensation.program.reading.offsets import Offsets, read_parameters
+from errormotion.compensation.program.reading.reader import Reader
 from errormotion.compensation.program.reading.tools import Cutter, read_table
 from errormotion.errors import ProgramError
 
@@ -108,3 +113,27 @@ def test_a_changed_cut_is_found(change: tuple[str, str]) -> None:
     assert paths.compare(lines, lines, ORIGINS, 1e-6) == 7
     with pytest.raises(ProgramError, match="the new program"):
         paths.compare(lines, text.replace(*change).split("\n"), ORIGINS, 1e-6)
+
+
+@pytest.mark.parametrize("other_unit", [False, True])
+@pytest.mark.parametrize("seed", [1, 5, 14])
+def test_random_programs_that_read_their_control_are_expanded_as_it_reads_them(
+    seed: int, other_unit: bool, tmp_path: Path
+) -> None:
+    random = Random(seed)
+    offsets = control(random, tmp_path)
+    unit = ("inch" if offsets.unit == "mm" else "mm") if other_unit else offsets.unit
+    lines = Reading(random, unit).lines(25)
+    digit = {"mm": 1e-7, "inch": 4e-6}[unit]
+    with closing(canonical.commands(lines, offsets)) as commands:
+        new = [str(text) for text in Expansion(lines, offsets, 1e-5).lines(commands)]
+    assert check(new, offsets, Reader(offsets)) > 20
+    assert paths.compare(lines, new, offsets, digit) > 20
+
+
+def test_a_flag_of_the_parameter_file_is_read_as_it_is(tmp_path: Path) -> None:
+    offsets = machine(tmp_path, "mm")
+    offsets = replace(offsets, parameters=offsets.parameters | {5210: 1.0}, g92=np.zeros(3), stored=np.zeros(3))
+    lines = [*HEAD, "G1 X[#5210 + 4]", "M2"]
+    with closing(canonical.commands(lines, offsets)) as commands:
+        assert "G1 X5.0000" in list(Expansion(lines, offsets, 1e-5).lines(commands))

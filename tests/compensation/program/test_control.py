@@ -192,3 +192,11 @@ def test_parameters_that_the_control_keeps_and_the_new_program_does_not_set_are_
     program.write_text("\n".join([*HEAD, "#150=3 #32=4", "G1 X[#150+#32]", "M2"]))
     found = compensate(program, tmp_path / "b.ngc", zero, control(tmp_path), Settings())
     assert found.notes == ("the new program does not set #150, which the parameter file keeps for other programs",)
+
+
+@needs_linuxcnc
+def test_a_long_line_whose_parameters_are_known_is_read(tmp_path: Path) -> None:
+    line = f"G1 X#150 ({'x' * 225})"
+    assert ends([*HEAD, line, "M2"], control(tmp_path))[0][0] == pytest.approx(12.5)
+    with pytest.raises(ProgramError, match="too many parameters in one line"):
+        ends([*HEAD, "G1 X[" + "+".join(f"#{k}" for k in range(40, 60)) + "]", "M2"], control(tmp_path))

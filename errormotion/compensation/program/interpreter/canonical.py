@@ -258,7 +258,7 @@ def _write_parameters(offsets: Offsets, path: Path, scale: float, unstated: floa
     }
     own = scale == UNITS[offsets.unit]
     values |= {key: value for key, value in offsets.parameters.items() if key <= 5000 or (own and key < 5400)}
-    values |= {5210: float(bool(np.any(offsets.g92))), 5220: offsets.system + 1.0}
+    values |= {5210: offsets.parameters.get(5210, float(bool(np.any(offsets.g92)))), 5220: offsets.system + 1.0}
     for k in range(3):
         values[5161 + k], values[5181 + k] = offsets.homes[:, k] / scale
         values[5211 + k] = offsets.stored[k] / scale

@@ -195,7 +195,7 @@ class Parameters:
             pieces.append(text[start:end])
             at = end
         new = "".join(pieces)
-        if len(new) > MAX_BLOCK - 10:
+        if len(new) > max(len(text), MAX_BLOCK - 10):
             raise refusal(number, text, "too many parameters in one line to check that the program sets all of them")
         return new
 
