@@ -239,7 +239,7 @@ def main() -> None:
     """Read programs, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--programs", type=lambda text: int(float(text)), default=1_000_000)
-    parser.add_argument("--reading", type=lambda text: int(float(text)), default=10_000, help="of programs that read")
+    parser.add_argument("--reading", type=lambda text: int(float(text)), default=2000, help="programs that read")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="end earlier")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
