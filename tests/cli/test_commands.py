@@ -103,13 +103,21 @@ def test_plugin_check_prints_each_check_and_fails_with_the_plugin(
     from errormotion.testing.kit import CheckResult
 
     good, bad = CheckResult("open", True, "opens", 0.1), CheckResult("close", False, "a thread is left", 0.2)
-    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address, mutants: [good], raising=False)
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, **more: [good], raising=False)
     assert "dcon_temperature: passes" in run("plugins", "check", "dcon_temperature").stdout
-    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, address, mutants: [good, bad], raising=False)
+    monkeypatch.setattr(testing, "check_plugin", lambda group, plugin, **more: [good, bad], raising=False)
     assert answer("plugins", "check", "dcon_temperature", code=3)["ok"] is False
     text = run("plugins", "check", "dcon_temperature", code=3).stdout
     assert "FAILED  close" in text
     assert "1 of 2 checks failed" in text
+
+
+def test_single_checks_of_a_plugin_are_chosen_by_name(run: Run, answer: Answer) -> None:
+    found = answer("plugins", "check", "dcon_temperature", "--only", "identify", "--only", "info_complete")
+    assert [each["name"] for each in found["checks"]] == ["info_complete", "identify"]
+    assert (
+        "Did you mean 'identify'?" in run("plugins", "check", "dcon_temperature", "--only", "identity", code=1).stderr
+    )
 
 
 def test_identify_writes_errors_once(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:

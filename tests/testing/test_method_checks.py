@@ -9,6 +9,7 @@ import xarray as xr
 from pydantic import ConfigDict
 
 from errormotion import datasets
+from errormotion.datasets.results.merit import last_values
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
@@ -299,6 +300,18 @@ class LeavesATextInEnglish(Sound):
         return {"Drift of a body": "Drift eines Körpers"} if language == "de" else {}
 
 
+class StatesFigures(Sound):
+    @staticmethod
+    def figures(errors):
+        return last_values(errors)
+
+
+class IsTooSureOfItsFigures(Sound):
+    @staticmethod
+    def figures(errors):
+        return [replace(each, expanded_uncertainty=each.expanded_uncertainty / 3) for each in last_values(errors)]
+
+
 class RollsItsOwnDice(Redrawn):
     def generator(self, given):
         return np.random.default_rng()
@@ -323,6 +336,7 @@ BROKEN = [
     ("recovers_truth", ExaggeratesOneInstant),
     ("coverage", HidesABias),
     ("differences", ForgetsWhatTimesShare),
+    ("figures", IsTooSureOfItsFigures),
     ("sources_drawn", RollsItsOwnDice),
     ("sources_drawn", ForgetsItsCalibration),
     ("sources_as_stated", DrawsHalfOfItsCalibration),
@@ -338,7 +352,7 @@ BROKEN = [
     ("round_trip", ReadsMemoryOnly),
     ("plan", PlansOneFreedom),
 ]
-STATISTICAL = ("recovers_truth", "coverage", "differences", "sources_as_stated")
+STATISTICAL = ("recovers_truth", "coverage", "figures", "differences", "sources_as_stated")
 
 
 @pytest.mark.parametrize(("check", "plugin"), BROKEN, ids=lambda value: getattr(value, "__name__", value))
@@ -352,6 +366,14 @@ def test_a_method_that_draws_its_sources_as_stated_passes():
     results = {result.name: result for result in run_checks(replace(SOUND, plugin=Redrawn, seeds=20))}
     assert [name for name, result in results.items() if not result.ok] == []
     assert not results["sources_as_stated"].skipped
+
+
+def test_a_method_with_honest_figures_passes():
+    check = next(check for check in METHOD_CHECKS if check.name == "figures")
+    result = run_check(check, replace(SOUND, plugin=StatesFigures, seeds=20))
+    assert (result.ok, result.skipped) == (True, False)
+    assert "20 seeds; 6 figures" in result.message
+    assert run_check(check, SOUND).skipped
 
 
 def test_for_every_check_a_plugin_fails():

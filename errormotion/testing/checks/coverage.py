@@ -13,11 +13,12 @@ import math
 from functools import lru_cache
 
 import numpy as np
+import xarray as xr
 from scipy import stats
 
 from errormotion.plugins import MethodSubject
 from errormotion.testing.kit import require
-from errormotion.testing.results import covariance, influence, names, truth_at_places, values
+from errormotion.testing.results import covariance, influence, names, place_dims, truth_at_places, values
 
 #: Probability that a method with a correct covariance fails one of the checks below.
 FALSE_ALARM = 1e-3
@@ -75,6 +76,65 @@ def differences(subject: MethodSubject) -> str:
     between = f"between points {places[0]} and {places[1]}"
     verdict = require_honest(difference, spread, _labels(subject), between, share=1)
     return f"{len(errors)} seeds; {verdict}"
+
+
+def no_figures(subject: MethodSubject) -> str:
+    """Return why the check of the figures does not apply: the result has none that follow from the errors alone."""
+    if not hasattr(subject.plugin, "figures"):
+        return "the method states no figures"
+    try:
+        result, truth = subject.outcome(0)
+        known = _of_errors(subject, result).items() ^ _true_figures(subject, result, truth).items()
+    except Exception:  # noqa: BLE001 - the check states the error
+        return ""
+    return "" if known else "the result has no figures that follow from its errors alone"
+
+
+def figures(subject: MethodSubject) -> str:
+    """Over many seeds, the stated intervals (k = 2) of the figures of merit contain those of the true errors."""
+    seeds = subject.seeds or MIN_SEEDS
+    held: dict[str, list[bool]] = {}
+    for seed in range(seeds):
+        result, truth = subject.outcome(seed)
+        stated = _of_errors(subject, result)
+        for name, (true, _) in _true_figures(subject, result, truth).items():
+            value, U = stated.get(name, (math.nan, math.nan))
+            if np.isfinite([true, value, U]).all() and true != value:  # equal: computed from other variables
+                held.setdefault(name, []).append(abs(value - true) <= U)
+    usual = {name: hits for name, hits in held.items() if 2 * len(hits) >= seeds}  # the name may state a place
+    require(bool(usual), "no figure of most seeds is known from the truth")
+    level = float(2 * stats.norm.cdf(2) - 1)
+    for name, hits in usual.items():
+        low = float(stats.binom.ppf(FALSE_ALARM / len(usual), len(hits), level))
+        require(
+            sum(hits) >= low,
+            f"the interval of '{name}' contains the true figure for {sum(hits)} of {len(hits)} seeds; expected at "
+            f"least {low:.0f}",
+        )
+    worst = min(float(np.mean(hits)) for hits in usual.values())
+    return f"{seeds} seeds; {len(usual)} figures, {100 * worst:.0f} % or more hold"
+
+
+def _of_errors(subject: MethodSubject, errors: xr.Dataset) -> dict[str, tuple[float, float]]:
+    """Return value and U of the figures that the plugin computes from the errors alone, by name."""
+    found = subject.plugin.figures(errors)
+    return {each.name: (each.value, each.expanded_uncertainty) for each in found if each.influence is None}
+
+
+def _true_figures(subject: MethodSubject, result: xr.Dataset, truth: xr.Dataset) -> dict[str, tuple[float, float]]:
+    """Return the figures of the true errors at the points of a result, as `_of_errors`."""
+    return _of_errors(subject, _with_values(result, truth_at_places(result, truth)))
+
+
+def _with_values(errors: xr.Dataset, true: np.ndarray) -> xr.Dataset:
+    """Return a result with other estimates, (place, n), where it has one."""
+    dims = place_dims(errors)
+    changed = {}
+    for k, name in enumerate(names(errors)):
+        old = errors[name].transpose(*dims)
+        new = np.where(np.isfinite(old.values), true[:, k].reshape(old.shape), np.nan)
+        changed[name] = (dims, new, old.attrs)
+    return errors.assign(changed)
 
 
 def tested_places(subject: MethodSubject) -> tuple[int, ...]:
