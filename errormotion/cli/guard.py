@@ -18,6 +18,7 @@ import typer
 
 from errormotion.cli import output
 from errormotion.errors import ErrormotionError
+from errormotion.state import close_to_others, own_folder, state_folder
 
 OK, ERROR, USAGE, INVALID, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 70, 130
 NONCONFORMING, UNDECIDED = 4, 5
@@ -71,13 +72,16 @@ def fail(message: str, error: BaseException, code: int, as_json: bool) -> None:
 
 def log_file() -> Path:
     """Return the log of the commands, ``errormotion.log`` in the user's state folder."""
-    state = os.environ.get("XDG_STATE_HOME")
-    base = Path(state) if state else Path.home() / ".local" / "state"
-    return base / "errormotion" / "errormotion.log"
+    return state_folder() / "errormotion.log"
 
 
 class _LogHandler(RotatingFileHandler):
     """Ignores write errors: a full disk must not end a command because of its log."""
+
+    def _open(self) -> Any:
+        """Open the log for its user only; a link is not followed."""
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW
+        return os.fdopen(os.open(self.baseFilename, flags, 0o600), "a", encoding=self.encoding)
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass
@@ -96,7 +100,8 @@ def _log() -> Iterator[None]:
     path = log_file()
     handler: logging.Handler
     try:
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        own_folder()
+        close_to_others(path)
         handler = _LogHandler(path, maxBytes=2**20, backupCount=1, encoding="utf-8", delay=True)
     except OSError:
         # Not in the folder for temporary files: anyone could have placed a link under the name there.

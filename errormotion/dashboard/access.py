@@ -6,12 +6,14 @@ import hmac
 import ipaddress
 import platform
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 from urllib.parse import urlsplit
 
 LOOPBACK = "127.0.0.1"
+CONTROL_HEADER = "X-Errormotion-Control"
+"""Header of requests that start, stop or change something."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,17 @@ class Access:
     secure : bool
         Whether the connection is encrypted.
     session : str
-        Secret that a browser receives in return for the token; new at every start.
+        Secret that a browser receives in return for the token; new at every start. It is a cookie, which browsers send
+        to every port of the computer: it permits to read, not to control.
+    secret : str
+        Secret from which the token for control is computed; new at every start.
     """
 
     names: frozenset[str]
     token: str = ""
     secure: bool = False
     session: str = field(default_factory=lambda: secrets.token_urlsafe(32))
+    secret: str = field(default_factory=lambda: secrets.token_urlsafe(32))
 
     def allows_host(self, host: str) -> bool:
         """Return whether the header ``Host`` of a request names this server."""
@@ -46,7 +52,9 @@ class Access:
         if origin is None:
             return False
         try:
-            return bool(host) and urlsplit(origin).netloc.casefold() == host.casefold()
+            found = urlsplit(origin)
+            scheme = "https" if self.secure else "http"
+            return bool(host) and found.scheme == scheme and found.netloc.casefold() == host.casefold()
         except ValueError:
             return False
 
@@ -57,6 +65,41 @@ class Access:
     def accepts_session(self, session: str | None) -> bool:
         """Return whether a request may read: no token is required, or its browser has presented the token."""
         return not self.token or _equal(session or "", self.session)
+
+    def control_for(self, host: str) -> str:
+        """Return the token for control that a page of a host has: a header, which no other page can send."""
+        return hmac.new(self.secret.encode(), host.casefold().encode("utf-8", "replace"), sha256).hexdigest()
+
+    def accepts_control(self, token: str | None, host: str) -> bool:
+        """Return whether a request may control: its header has the token of the host that it names."""
+        return _equal(token or "", self.control_for(host))
+
+    def refusal(
+        self, method: str, headers: Mapping[str, str], session: str | None, *, public: bool, controls: bool
+    ) -> tuple[int, str] | None:
+        """Return status and reason of the refusal of a request, by its header alone; None if it is admitted.
+
+        Parameters
+        ----------
+        method : str
+        headers : mapping
+        session : str, optional
+            Session in its cookie.
+        public : bool
+            Whether it needs no session.
+        controls : bool
+            Whether it starts, stops or changes something.
+        """
+        host = headers.get("Host", "")
+        if not self.allows_host(host):
+            return 421, "The host name is not one of this server; see --name"
+        if method not in ("GET", "HEAD") and not self.same_origin(headers.get("Origin"), host):
+            return 403, "The request is not from a page of this server"
+        if not public and not self.accepts_session(session):
+            return 403, "The token is required"
+        if controls and not self.accepts_control(headers.get(CONTROL_HEADER), host):
+            return 403, "The token is required again to control a machine; open the page /login"
+        return None
 
 
 def access_for(host: str, names: Iterable[str] = (), *, secure: bool = False, control: bool = False) -> Access:

@@ -148,10 +148,21 @@ class Compensations:
         CompensationError
             The compensation does not exist.
         """
+        folder = self.folder_of(key)
+        return self._following.get(key, lambda: Following(folder))
+
+    def folder_of(self, key: str) -> Path:
+        """Return the run folder of a compensation by its name.
+
+        Raises
+        ------
+        CompensationError
+            The compensation does not exist.
+        """
         fits = 0 < len(key.encode("utf-8", "surrogatepass")) <= MAX_NAME and key == Path(key).name
         if not fits or not (self.runs / key / AUDIT).is_file():
             raise CompensationError(f"No compensation {key[:100]!r} in {self.runs}.")
-        return self._following.get(key, lambda: Following(self.runs / key))
+        return self.runs / key
 
     def listed(self) -> list[tuple[str, bool, Status | None, str]]:
         """Return name, whether it is running, state and mistake of each; running ones first, then the newest."""

@@ -11,12 +11,13 @@ from importlib.resources import files
 from pathlib import Path
 
 from bokeh.util.paths import bokehjs_path
-from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPHeaders, parse_cookie
 from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, StaticFileHandler
 
 from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
+from errormotion.dashboard.door import Door, Server
 from errormotion.dashboard.lab import Lab
 from errormotion.dashboard.pages import compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
@@ -29,6 +30,7 @@ PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare
 """Paths and titles of the pages in the menu."""
 BOKEH = ("bokeh.min.js",)
 """Scripts of bokeh that pages load."""
+LOGIN = "/login"
 WORKERS = 4
 """Number of threads for fast functions."""
 SLOW_WORKERS = 2
@@ -37,8 +39,12 @@ MAX_REQUEST = 1 << 20
 """Largest size of a request, bytes."""
 MAX_HEADER = 1 << 15
 """Largest size of the header of a request, bytes."""
+MAX_LOGIN = 1 << 12
+"""Largest size of a request with a token, bytes."""
 IDLE_TIMEOUT = 60.0
 """Time after which an idle connection is closed, s."""
+BODY_TIMEOUT = 10.0
+"""Time for the body of a request to arrive, s."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ def application(context: Context) -> Application:
     return Application(
         [
             (r"/", Start, one),
-            (r"/login", Login, one),
+            (LOGIN, Login, one),
             (r"/now", now.Now, one),
             (r"/now/values\.json", now.Values, one),
             (r"/now/figure\.json", now.Figure, one),
@@ -123,6 +129,24 @@ def application(context: Context) -> Application:
         log_function=note_request,
         compress_response=True,
     )
+
+
+def door_of(context: Context, served: Application) -> Door:
+    """Return the door of an application: requests with a body are refused by their header."""
+
+    def refusal(method: str, path: str, headers: HTTPHeaders) -> tuple[int, str] | None:
+        session = _cookie(headers.get("Cookie", ""), context.cookie)
+        return context.access.refusal(method, headers, session, public=path == LOGIN, controls=False)
+
+    return Door(served, refusal, lambda path: MAX_LOGIN if path == LOGIN else MAX_REQUEST)
+
+
+def _cookie(text: str, name: str) -> str | None:
+    try:
+        found = parse_cookie(text)
+    except ValueError:
+        return None
+    return found.get(name)
 
 
 async def serve(options: Options, started: Callable[[str, Access], None], end: asyncio.Event | None = None) -> None:
@@ -160,15 +184,16 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         context = Context(
             access, Lab(options.runs), port, workers, slow, pages, watch, options.control, options.campaigns
         )
-        server = HTTPServer(
-            application(context),
+        server = Server(
+            door_of(context, application(context)),
             ssl_options=context_of_tls,
             idle_connection_timeout=IDLE_TIMEOUT,
-            body_timeout=IDLE_TIMEOUT,
+            body_timeout=BODY_TIMEOUT,
             max_body_size=MAX_REQUEST,
             max_buffer_size=MAX_REQUEST,
             max_header_size=MAX_HEADER,
         )
+        server.budget = context.budget
         server.add_sockets(sockets)
         if watch is not None:
             watch.start()
@@ -180,6 +205,9 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
             if watch is not None:
                 await asyncio.to_thread(watch.stop)
             await server.close_all_connections()
+            await context.planner.end()
+            context.states.shutdown()
+            context.stops.shutdown()
 
 
 def run(options: Options, started: Callable[[str, Access], None]) -> None:

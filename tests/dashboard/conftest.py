@@ -16,7 +16,7 @@ import pytest
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
-from errormotion.dashboard.access import Access
+from errormotion.dashboard.access import CONTROL_HEADER, Access
 from errormotion.datasets import provenance
 from errormotion.datasets.results.build import build_errors
 
@@ -37,9 +37,16 @@ class Served:
     cookie: str = ""
     """Session of a client that has presented the token; empty: `ask` is one that has not."""
 
+    @property
+    def control(self) -> str:
+        """Token for control that a page of this address has."""
+        return self.access.control_for(urlsplit(self.address).netloc)
+
     def enter(self, page: Any, path: str) -> None:
         """Open a page in a browser that has presented the token."""
         name, _, value = self.cookie.partition("=")
+        stored = f"localStorage.setItem('errormotion-control', '{self.control}')"
+        page.add_init_script(f"try {{ {stored}; }} catch {{}}")  # a sandboxed report has no storage
         page.context.add_cookies([{"name": name, "value": value, "url": self.address}])
         page.goto(self.address + path)
 
@@ -48,7 +55,9 @@ class Served:
         where = urlsplit(self.address)
         connection = http.client.HTTPConnection(str(where.hostname), where.port, timeout=20)
         try:
-            own = {"Accept": "text/html"} | ({"Cookie": self.cookie} if self.cookie else {})
+            own = {"Accept": "text/html"}
+            if self.cookie:
+                own |= {"Cookie": self.cookie, CONTROL_HEADER: self.control}
             connection.request(method, path, body or None, {**own, **headers})
             answer = connection.getresponse()
             return answer.status, dict(answer.getheaders()), answer.read().decode()

@@ -26,9 +26,23 @@ def test_a_page_under_a_foreign_name_is_refused(host: str) -> None:
 
 
 def test_origin_is_that_of_the_page_itself() -> None:
-    assert NETWORK.same_origin("https://lab-pc.example:5006", "Lab-PC.example:5006")
-    for origin in (None, "null", "https://evil.example", "https://lab-pc.example:5007", "https://[", ""):
+    assert NETWORK.same_origin("http://lab-pc.example:5006", "Lab-PC.example:5006")
+    secure = access_for("0.0.0.0", ["lab-pc.example"], secure=True)
+    assert secure.same_origin("https://lab-pc.example:5006", "Lab-PC.example:5006")
+    foreign = (
+        None,
+        "null",
+        "http://evil.example",
+        "http://lab-pc.example:5007",
+        "http://[",
+        "",
+        "//lab-pc.example:5006",
+    )
+    schemes = ("https://lab-pc.example:5006", "ftp://lab-pc.example:5006", "wss://lab-pc.example:5006")
+    for origin in (*foreign, *schemes):
         assert not NETWORK.same_origin(origin, "lab-pc.example:5006")
+    for origin in ("http://lab-pc.example:5006", "ws://lab-pc.example:5006", *foreign):
+        assert not secure.same_origin(origin, "lab-pc.example:5006")
     assert not NETWORK.same_origin("", "")
 
 
@@ -39,3 +53,13 @@ def test_token_opens_and_session_is_another_secret() -> None:
     assert not any(NETWORK.accepts_session(text) for text in (None, "", NETWORK.token))
     assert not Access(frozenset()).accepts_token("")
     assert Access(frozenset()).accepts_session(None)
+
+
+def test_the_token_for_control_is_that_of_one_host_and_no_cookie() -> None:
+    token = NETWORK.control_for("lab-pc.example:5006")
+    assert NETWORK.accepts_control(token, "LAB-pc.example:5006")
+    for host in ("lab-pc.example:5007", "lab-pc.example", "192.168.1.5:5006", ""):
+        assert not NETWORK.accepts_control(token, host)
+    for other in (None, "", NETWORK.token, NETWORK.session, NETWORK.secret, token[:-1]):
+        assert not NETWORK.accepts_control(other, "lab-pc.example:5006")
+    assert not access_for("0.0.0.0").accepts_control(token, "lab-pc.example:5006")

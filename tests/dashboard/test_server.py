@@ -176,9 +176,14 @@ def test_the_connection_is_encrypted_with_a_certificate(
     kind = "application/x-www-form-urlencoded"
     connection.request("POST", "/login", body, {"Origin": f"https://127.0.0.1:{port}", "Content-Type": kind})
     answer = connection.getresponse()
-    connection.close()
+    answer.read()
     assert answer.status == 302
     assert "Secure" in str(answer.headers["Set-Cookie"])
+    assert int(answer.headers["Strict-Transport-Security"].removeprefix("max-age=")) >= 180 * 24 * 3600
+    connection.request("GET", "/nowhere")
+    answer = connection.getresponse()
+    connection.close()
+    assert "Strict-Transport-Security" in answer.headers
 
 
 def test_a_client_that_does_not_read_delays_no_other_client(open_to_this_computer: Any, key: str) -> None:

@@ -17,8 +17,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
-from errormotion.datasets.files.state import own_folder, state_folder
 from errormotion.errors import CompensationError
+from errormotion.state import own_folder, state_folder
 
 KEY, FOLDER = "audit.key", "audit"
 KEY_BYTES = 32

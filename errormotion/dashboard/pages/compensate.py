@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
 from collections.abc import Sequence
@@ -17,16 +18,18 @@ from errormotion.campaign.compensation.following import Status, is_working, read
 from errormotion.compensation.online.audit import Verdict
 from errormotion.compensation.online.follower import State as States
 from errormotion.dashboard.cache import TimedCache
-from errormotion.dashboard.compensations import Compensations, Start, rows
+from errormotion.dashboard.compensations import Bench, Compensations, Model, Start, rows
 from errormotion.dashboard.curves import thin
 from errormotion.dashboard.figures import following_item
 from errormotion.dashboard.pages.effect import EffectOfRuns, Report
-from errormotion.dashboard.pages.page import MAX_MESSAGE, Context, Guarded
-from errormotion.errors import CompensationError, ErrormotionError
+from errormotion.dashboard.pages.page import Context, Guarded
+from errormotion.errors import CompensationError
 
 SPANS = (("10 min", 600), ("1 h", 3600), ("8 h", 28800))
 """Possible time spans of the curves, s."""
 STATES = tuple(States)
+LISTS_TIMEOUT = 5.0
+"""Time for which the page waits for benches and models, s."""
 MAX_POINTS = 1000
 """Number of points of a reduced curve."""
 LATE = 3.0
@@ -39,10 +42,21 @@ class _Compensating(Guarded):
         super().initialize(context)
         self.compensations = compensations
 
-    def page(self, wrong: str = "") -> None:
-        """Send the page; ``wrong`` states why the last request was refused."""
-        known = self.compensations
-        benches, models = (known.benches(), known.models()) if self.context.control else ([], [])
+
+class Compensate(_Compensating):
+    """The page; `State` and `Curves` provide its values."""
+
+    async def get(self) -> None:
+        """Send the page without values; it has the stop buttons, and waits for benches and models a short time only."""
+        known, read = self.compensations, True
+        benches: list[Bench] = []
+        models: list[Model] = []
+        if self.context.control:
+            try:
+                found = self.in_slow_thread(lambda: (known.benches(), known.models()))
+                benches, models = await asyncio.wait_for(found, LISTS_TIMEOUT)
+            except (TimeoutError, HTTPError):
+                read = False
         self.show(
             "compensate.html.j2",
             control=self.context.control,
@@ -50,21 +64,11 @@ class _Compensating(Guarded):
             folder=known.folder,
             benches=benches,
             models=models,
+            read=read,
             states=STATES,
             spans=SPANS,
-            requested={name: self.get_argument(name, "")[:400] for name in ("bench", "model", "mode")},
             chosen=self.value("run"),
-            wrong=wrong[:MAX_MESSAGE],
         )
-
-
-class Compensate(_Compensating):
-    """The page; `State` and `Curves` provide its values."""
-
-    async def get(self) -> None:
-        """Send the page without values."""
-        await self.in_slow_thread(self.compensations.models)  # read in a thread; the page takes them from the cache
-        self.page()
 
 
 class Begin(_Compensating):
@@ -79,13 +83,8 @@ class Begin(_Compensating):
             raise HTTPError(400, reason="Expected shadow or armed")
         arm = self.get_body_argument("machine", "", strip=False) if mode == "armed" else None
         chosen = [self.get_body_argument(name, "") for name in ("bench", "model")]
-        try:
-            await self.in_slow_thread(self.compensations.start, *chosen, arm)
-        except ErrormotionError as error:
-            self.set_status(400)
-            self.page(str(error))
-            return
-        self.redirect("/compensate", status=303)
+        await self.in_slow_thread(self.compensations.start, *chosen, arm)
+        self.finish({"next": "/compensate"})
 
 
 class Stop(_Compensating):
@@ -96,13 +95,8 @@ class Stop(_Compensating):
     async def post(self) -> None:
         """Write the request, which the compensation checks for in each period."""
         key = self.get_body_argument("run", "")
-        try:
-            await self.in_thread(request_stop, self.compensations.following(key).folder)
-        except ErrormotionError as error:
-            self.set_status(400)
-            self.page(str(error))
-            return
-        self.redirect("/compensate?" + urlencode({"run": key}), status=303)
+        await self.in_stop_thread(lambda: request_stop(self.compensations.folder_of(key)))
+        self.finish({"next": "/compensate?" + urlencode({"run": key})})
 
 
 class State(_Compensating):
@@ -113,7 +107,9 @@ class State(_Compensating):
         key = self.value("run", 255)
         self.set_header("Content-Type", "application/json")
         known = self.compensations
-        self.finish(await self.in_thread(_STATES.get, (known.runs, key, len(known.starts)), lambda: _state(known, key)))
+        self.finish(
+            await self.in_state_thread(_STATES.get, (known.runs, key, len(known.starts)), lambda: _state(known, key))
+        )
 
 
 class Curves(_Compensating):

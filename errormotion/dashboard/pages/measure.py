@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from tornado.ioloop import IOLoop
 from tornado.web import HTTPError
 
 from errormotion.campaign.background import processes
@@ -89,6 +90,7 @@ class Measure(_OfCampaigns):
     async def get(self) -> None:
         """Show the list of campaign files and one campaign."""
         campaigns = self.campaigns()
+        IOLoop.current().spawn_callback(self.context.planner.prepare)
         names = await self.in_thread(campaigns.names)
         name = self.get_query_argument("file", None)
         name = (names[0] if names else "") if name is None else self.value("file")
@@ -134,7 +136,9 @@ class Plan(_OfCampaigns):
     async def post(self) -> None:
         """Send the plan."""
         name, text = self.body("file", "text")
-        self.finish({"tests": await self.in_slow_thread(self.campaigns().plan, name, text)})
+        self.finish(
+            {"tests": await self.ending_with_the_client(self.context.planner.plan(self.campaigns(), name, text))}
+        )
 
 
 class Save(_OfCampaigns):
@@ -181,7 +185,7 @@ class Stop(_OfCampaigns):
     async def post(self) -> None:
         """Stop the process."""
         (name,) = self.body("process")
-        await self.in_thread(processes.stop, self.context.lab.runs, name)
+        await self.in_stop_thread(processes.stop, self.context.lab.runs, name)
         self.finish({})
 
 
@@ -206,7 +210,7 @@ class Processes(Guarded):
     async def get(self) -> None:
         """Send the running processes, and the last ended ones."""
         runs = self.context.lab.runs
-        self.finish({"processes": await self.in_thread(_PROCESSES.get, runs, lambda: _processes(runs))})
+        self.finish({"processes": await self.in_state_thread(_PROCESSES.get, runs, lambda: _processes(runs))})
 
 
 class Live(Guarded):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Callable
-from concurrent.futures import Executor
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +16,9 @@ from tornado.web import HTTPError, RequestHandler
 
 from errormotion import __version__
 from errormotion.dashboard.access import Access
+from errormotion.dashboard.door import Budget
 from errormotion.dashboard.lab import Lab, NotFoundError
+from errormotion.dashboard.planning import Planner
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
 from errormotion.report.text import signs
@@ -30,6 +33,12 @@ POLICY = (
     "font-src 'self'; connect-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 """Content security policy: resources of this server only, and no inline scripts."""
+STATE_WORKERS, STOP_WORKERS = 2, 2
+"""Number of threads for the states on the pages with a stop button, and for requests to stop."""
+HSTS = 365 * 24 * 3600
+"""Time for which browsers connect to this host by TLS only, s."""
+MAX_QUEUED = 64
+"""Number of requests that wait for a thread of one kind."""
 MAX_MESSAGE = 2000
 """Longest message on a page, characters."""
 
@@ -72,6 +81,12 @@ class Context:
     campaigns: Path = Path()
     """Folder of the campaign files."""
     environment: Environment = field(default_factory=_environment)
+    states: Executor = field(default_factory=lambda: ThreadPoolExecutor(STATE_WORKERS))
+    """For the states on the pages from which something is stopped; used by nothing slow."""
+    stops: Executor = field(default_factory=lambda: ThreadPoolExecutor(STOP_WORKERS))
+    """For requests to stop, and nothing else."""
+    planner: Planner = field(default_factory=Planner)
+    budget: Budget = field(default_factory=Budget)
 
     @property
     def cookie(self) -> str:
@@ -89,6 +104,8 @@ class Guarded(RequestHandler):
     def initialize(self, context: Context) -> None:
         """Set the context of the server."""
         self.context = context
+        self._work: list[asyncio.Future[Any]] = []
+        self._require_encryption()
 
     def set_default_headers(self) -> None:
         """Set the headers of every answer."""
@@ -102,32 +119,75 @@ class Guarded(RequestHandler):
             ("Cache-Control", "no-store"),
         ):
             self.set_header(name, value)
+        if hasattr(self, "context"):  # not in the constructor, which `initialize` follows
+            self._require_encryption()
+
+    def _require_encryption(self) -> None:
+        if self.context.access.secure:
+            self.set_header("Strict-Transport-Security", f"max-age={HSTS}")
 
     def prepare(self) -> None:
         """Refuse a request that violates the rules of access."""
-        access, host = self.context.access, self.request.headers.get("Host", "")
-        if not access.allows_host(host):
-            raise HTTPError(421, reason="The host name is not one of this server; see --name")
-        if self.request.method not in ("GET", "HEAD") and not access.same_origin(
-            self.request.headers.get("Origin"), host
-        ):
-            raise HTTPError(403, reason="The request is not from a page of this server")
-        if self.public or access.accepts_session(self.get_cookie(self.context.cookie)):
-            if self.controls and not self.context.control:
-                raise HTTPError(403, reason="The dashboard was started without --allow-control")
+        access, session = self.context.access, self.get_cookie(self.context.cookie)
+        method, host = str(self.request.method), self.request.headers.get("Host", "")
+        found = access.refusal(
+            method, self.request.headers, session, public=self.public, controls=self.controls and self.context.control
+        )
+        if found is None and self.controls and not self.context.control:
+            found = 403, "The dashboard was started without --allow-control"
+        if found is None:
+            self.context.budget.begin(self._stream, trusted=bool(access.token) and access.accepts_session(session))
             return
-        if self.request.method in ("GET", "HEAD") and "text/html" in self.request.headers.get("Accept", ""):
+        wants_page = method in ("GET", "HEAD") and "text/html" in self.request.headers.get("Accept", "")
+        if wants_page and access.allows_host(host) and not self.controls:
             self.redirect("/login")
             return
-        raise HTTPError(403, reason="The token is required")
+        raise HTTPError(found[0], reason=found[1])
+
+    @property
+    def _stream(self) -> Any:
+        return getattr(self.request.connection, "stream", None)
+
+    def on_finish(self) -> None:
+        """Count the connection as idle."""
+        self.context.budget.end(self._stream)
+
+    def on_connection_close(self) -> None:
+        """Cancel the work for a client that has left; what waits for a thread is not begun."""
+        for each in self._work:
+            each.cancel()
 
     async def in_thread(self, work: Callable[..., T], *values: Any) -> T:
         """Return the result of a function that runs in a thread, so that other requests are not delayed."""
-        return await IOLoop.current().run_in_executor(self.context.workers, work, *values)
+        return await self._in(self.context.workers, work, *values)
 
     async def in_slow_thread(self, work: Callable[..., T], *values: Any) -> T:
         """Return the result of a slow function that runs in a thread."""
-        return await IOLoop.current().run_in_executor(self.context.slow, work, *values)
+        return await self._in(self.context.slow, work, *values)
+
+    async def in_state_thread(self, work: Callable[..., T], *values: Any) -> T:
+        """Return the result of a fast function for a page from which something is stopped."""
+        return await self._in(self.context.states, work, *values)
+
+    async def in_stop_thread(self, work: Callable[..., T], *values: Any) -> T:
+        """Return the result of a request to stop; it is carried out even if its client leaves."""
+        return await IOLoop.current().run_in_executor(self.context.stops, work, *values)
+
+    async def _in(self, threads: Executor, work: Callable[..., T], *values: Any) -> T:
+        if getattr(threads, "_work_queue").qsize() >= MAX_QUEUED:  # noqa: B009 - Executor states no number
+            raise HTTPError(503, reason="The server has too many requests; try again later")
+        return await self.ending_with_the_client(IOLoop.current().run_in_executor(threads, work, *values))
+
+    async def ending_with_the_client(self, work: Awaitable[T]) -> T:
+        """Return a result that is not required if the client leaves meanwhile."""
+        task = asyncio.ensure_future(work)
+        self._work.append(task)
+        try:
+            return await task
+        except asyncio.CancelledError:
+            raise HTTPError(408, reason="The client has left") from None
+        finally:
+            self._work.remove(task)
 
     def value(self, name: str, longest: int = 400) -> str:
         """Return a value of the query; empty if it is missing.

@@ -16,7 +16,7 @@ function cells(row, list) {
 }
 
 function stopButton(each) {
-  const form = element("form");
+  const form = element("form", undefined, "order");
   form.method = "post";
   form.action = "/compensate/stop";
   const run = element("input");
@@ -145,6 +145,19 @@ async function states() {
   }
   setTimeout(states, INTERVAL);
 }
+
+document.addEventListener("submit", async (event) => { // start and stop
+  const order = event.target.closest("form.order");
+  if (!order) return;
+  event.preventDefault();
+  try {
+    const found = await answerOf(order.getAttribute("action"), { body: new URLSearchParams(new FormData(order)), limit: 60000 });
+    location.assign(found.next);
+  } catch (error) {
+    byId("refused").textContent = error.message;
+    byId("refused").hidden = false;
+  }
+});
 
 const form = byId("history");
 let drawing = "", figure = null, asked = 0, timer = 0;

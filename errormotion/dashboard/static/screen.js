@@ -1,6 +1,8 @@
 // Shared functions of the pages. On large screens figures have larger text and height, as pages have by their style.
 "use strict";
 
+const CONTROL = "errormotion-control"; // key of the token for control, which no other port or host has
+
 const byId = (id) => document.getElementById(id);
 
 function element(name, text, className) {
@@ -12,11 +14,13 @@ function element(name, text, className) {
 
 // Send a request to the server; with a body by POST. A status of 403 leads to the login, since the dashboard may have been
 // restarted with another token; not with stay, if the page contains input of the user.
-async function answerOf(path, { body, limit = 10000, stay = false } = {}) {
+async function answerOf(path, { body, limit = 10000, stay = false } = {}) { // body: a value for JSON, or a form
   const options = { headers: { Accept: "application/json" }, signal: limit ? AbortSignal.timeout(limit) : undefined };
   if (body !== undefined) {
-    Object.assign(options, { method: "POST", body: JSON.stringify(body) });
-    options.headers["Content-Type"] = "application/json";
+    const isForm = body instanceof URLSearchParams;
+    Object.assign(options, { method: "POST", body: isForm ? body : JSON.stringify(body) });
+    if (!isForm) options.headers["Content-Type"] = "application/json";
+    options.headers["X-Errormotion-Control"] = localStorage.getItem(CONTROL) ?? "";
   }
   let answer;
   try {
