@@ -19,7 +19,7 @@ pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 from errormotion.dashboard import door, planning
 from errormotion.dashboard.access import CONTROL_HEADER
 from errormotion.dashboard.door import Budget, most_connections
-from errormotion.dashboard.pages import compare, compensate
+from errormotion.dashboard.pages import compare, compensate, login
 from errormotion.errors import RunError
 
 SOON = 10.0
@@ -114,6 +114,15 @@ def test_a_token_of_any_length_is_refused_without_reading_it(served: Any) -> Non
     with connected(served) as line:
         line.sendall(head_of(served, "/login", 5000))
         assert b" 400 " in line.recv(1000)
+
+
+def test_many_wrong_tokens_do_not_keep_the_stop_out(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(login, "DELAY", 60.0)
+    body = b'{"token": "wrong"}'
+    with ExitStack() as stack:
+        for _ in range(most_connections() + 20):
+            stack.enter_context(connected(served)).sendall(head_of(served, "/login", len(body)) + body)
+        assert stop(served) == 400
 
 
 def test_a_slow_body_of_a_known_client_ends(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:

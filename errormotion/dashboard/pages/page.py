@@ -136,7 +136,8 @@ class Guarded(RequestHandler):
         if found is None and self.controls and not self.context.control:
             found = 403, "The dashboard was started without --allow-control"
         if found is None:
-            self.context.budget.begin(self._stream, trusted=bool(access.token) and access.accepts_session(session))
+            if not self.public:  # one with a wrong token waits, and must not occupy its place
+                self.context.budget.begin(self._stream, trusted=bool(access.token))
             return
         wants_page = method in ("GET", "HEAD") and "text/html" in self.request.headers.get("Accept", "")
         if wants_page and access.allows_host(host) and not self.controls:
