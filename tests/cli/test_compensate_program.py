@@ -71,6 +71,21 @@ def test_the_result_is_printed(part: Path, volume: Path) -> None:
         assert words in text
 
 
+def test_what_is_read_otherwise_than_it_looks_or_is_not_corrected_is_stated(part: Path, volume: Path) -> None:
+    tools = part.with_name("tool.tbl")
+    tools.write_text("T1 P1 Z50\nT1 P2 Z60\nT2P2Z3\n")
+    part.write_text(PROGRAM.replace("M2\n", "M2\nG1 X5\n"))
+    arguments = (part, "--with", volume, "--offset", "G54=0,0,100", "--tools", tools)
+    code, text = run(*arguments)
+    assert code == 0, text
+    assert "not corrected: 1 lines after the end of the program, the first is line 9" in text
+    assert "note: tool.tbl, line 2: not used, because line 1 states tool 1, as in LinuxCNC" in text
+    code, text = run(*arguments, "--json", "--out", part.with_name("other.ngc"))
+    found = json.loads(text)
+    assert found["after_end"] == {"number": 1, "first_line": 9}
+    assert any("LinuxCNC reads 'T2P2Z3' as T2" in note for note in found["notes"])
+
+
 @pytest.mark.parametrize(
     ("options", "why"),
     [
