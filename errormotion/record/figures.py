@@ -47,6 +47,7 @@ class Reading:
     unit: str
     influence: Mapping[str, float] = field(default_factory=dict)
     origin: tuple[str, ...] = ()
+    version: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,18 +155,19 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
     u = _checked(stated.value, stated.expanded_uncertainty / 2)
     effects = dict[str, float]()
     origin: tuple[str, ...] = (entry.method,)
+    version = ""
     if entry.errors and (path / entry.errors).exists():
         from errormotion import datasets
 
         errors = datasets.load(path / entry.errors)
-        origin = _origin(errors)
+        origin, version = _origin(errors), _version(errors)
         given = _influence(errors, stated.name)
         for row, identity in _identified(errors):
             source = str(errors["source"].values[row])
             effect = _change(errors, row, stated.name) if given is None else float(given.get(source, 0.0))
             if np.isfinite(effect):
                 effects[identity] = effects.get(identity, 0.0) + effect
-    return Reading(entry.folder, stated.name, _time(entry), stated.value, u, stated.unit, effects, origin)
+    return Reading(entry.folder, stated.name, _time(entry), stated.value, u, stated.unit, effects, origin, version)
 
 
 def _influence(errors: xr.Dataset, name: str) -> Mapping[str, float] | None:
@@ -242,7 +244,8 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
         effects[identity] = effects.get(identity, 0.0) + float(effect)
     value = float(values[place])
     unit = str(errors[name].attrs.get("units", "m"))
-    return Reading(entry.folder, freedom[0], _time(entry), value, _checked(value, float(u)), unit, effects, origin)
+    u = _checked(value, float(u))
+    return Reading(entry.folder, freedom[0], _time(entry), value, u, unit, effects, origin, _version(errors))
 
 
 def _at_place(errors: xr.Dataset, at: Sequence[float] | None) -> tuple[xr.Dataset, int | None]:
@@ -281,6 +284,12 @@ def _origin(errors: xr.Dataset) -> tuple[str, ...]:
     return (*(str(errors.attrs.get(name, "")) for name in names), point)
 
 
+def _version(errors: xr.Dataset) -> str:
+    """Return method and version of a result; empty if it does not state them."""
+    parts = [str(errors.attrs.get(name, "")) for name in ("method", "method_version")]
+    return " ".join(parts) if all(parts) else ""
+
+
 def _series(found: list[Reading]) -> Series:
     """Return readings as a series; sources of a single run are part of its uncertainty."""
     units = {each.unit for each in found}
@@ -299,6 +308,7 @@ def _series(found: list[Reading]) -> Series:
         [each.run for each in found],
         [each.name for each in found],
         units.pop(),
+        [each.version for each in found],
     )
 
 

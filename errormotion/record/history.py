@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ TABLE: dict[str, tuple[tuple[str, ...], str, str]] = {
     "expanded_uncertainty": (("run",), "figure", "U (k = 2) that the run states"),
     "influence": (("source", "run"), "figure", "effect of one standard uncertainty of each source that runs share"),
     "source_id": (("source",), "text", "identity of each of these sources"),
+    "version": (("run",), "text", "method and its version; empty where unknown; not in histories of earlier versions"),
     "centre": (("run",), "figure", "centre of the control chart"),
     "lower_limit": (("run",), "figure", "lower control limit"),
     "upper_limit": (("run",), "figure", "upper control limit"),
@@ -63,6 +65,8 @@ TABLE: dict[str, tuple[tuple[str, ...], str, str]] = {
     "degrees": ((), "number", "its degrees of freedom"),
 }
 UNITS = ("m", "rad", "1", "degC")
+OPTIONAL = ("version",)
+"""Variables that histories of earlier versions do not contain."""
 
 
 def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None = None) -> xr.Dataset:
@@ -103,6 +107,7 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
         "expanded_uncertainty": 2 * series.u,
         "influence": series.influence if len(series.identities) else np.zeros((0, series.size)),
         "source_id": _texts(series.identities),
+        "version": _texts(series.versions or [""] * series.size),
         "centre": limits.centre,
         "lower_limit": limits.lower,
         "upper_limit": limits.upper,
@@ -149,6 +154,17 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
     return ds
 
 
+def version_changes(ds: xr.Dataset) -> list[tuple[int, str, str]]:
+    """Return each run whose method or its version differs from that of the run before: index, version before, version.
+
+    Runs of unknown version are passed over.
+    """
+    if "version" not in ds.variables:
+        return []
+    known = [(k, str(each)) for k, each in enumerate(ds["version"].values) if each]
+    return [(k, before, after) for (_, before), (k, after) in pairwise(known) if before != after]
+
+
 def _common_name(series: Series, figure: str) -> str:
     """Return the name of the figure if it is the same in all runs, otherwise the requested name."""
     names = set(series.names)
@@ -170,7 +186,9 @@ def _steps(series: Series, steps: Sequence[Step], notes: Sequence[Note]) -> dict
         before, after = float(t[step.index - 1]), float(t[step.index])
         away = [(max(before - _seconds(note), _seconds(note) - after, 0.0), note) for note in notes]
         inside = [(d, note) for d, note in away if t[step.first] <= _seconds(note) <= t[step.last]]
-        named.append("; ".join(note.text for _, note in sorted(inside, key=lambda pair: pair[0])))
+        versions = series.versions[step.first : step.last + 1]
+        changed = [f"{a} replaced by {b}" for a, b in pairwise(filter(None, versions)) if a != b]
+        named.append("; ".join([note.text for _, note in sorted(inside, key=lambda pair: pair[0])] + changed))
     return {
         "step_time": np.array(middle) - t[0],
         "step_low": np.array([t[step.first] for step in steps]) - t[0],
@@ -204,6 +222,8 @@ def violations(ds: xr.Dataset) -> list[str]:
     if "run" not in ds.coords:
         found.append("run: missing; expected the names of the runs")
     for name, (dims, unit, meaning) in TABLE.items():
+        if name not in ds.variables and name in OPTIONAL:
+            continue
         if name not in ds.variables:
             found.append(f"{name}: missing; expected {meaning}")
             continue

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure as Drawing
 
 from errormotion.arrays import Array
 from errormotion.datasets.files.events import instant
+from errormotion.record.history import version_changes
 from errormotion.record.text import date, field_of, sentences, sized, trend_text
 from errormotion.report.canvas import BLACK, BLUE, GREEN, PURPLE, VERMILLION, WIDTH, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
@@ -103,6 +104,8 @@ def _marks(axes: Axes, ds: xr.Dataset) -> None:
     """Draw notes as dotted lines with their numbers, and the interval of each step as a band."""
     for low, high in zip(ds["step_low"].values, ds["step_high"].values, strict=True):
         axes.axvspan(*map(float, _days(ds, np.array([low, high]))), color=VERMILLION, alpha=0.18, linewidth=0)
+    for k, *_ in version_changes(ds):
+        axes.axvline(*map(float, _days(ds, ds["time"].values[[k]])), color=BLACK, linewidth=0.9, linestyle=(0, (4, 2)))
     low, high = ds["time"].values[[0, -1]]
     inside = [k for k, t in enumerate(ds["event_time"].values) if low <= t <= high]
     for k, when in zip(inside, map(float, _days(ds, ds["event_time"].values[inside])), strict=True):
@@ -156,6 +159,8 @@ def _values_figure(ds: xr.Dataset, key: str) -> Figure:
             axes.plot(when[outlier], y[outlier], "D", ms=6, mfc="none", color=VERMILLION, label="outlier")
         if ds.sizes["step"]:
             axes.fill_between([], [], color=VERMILLION, alpha=0.18, label="time of a step")
+        if version_changes(ds):
+            axes.plot([], [], color=BLACK, linewidth=0.9, linestyle=(0, (4, 2)), label="version of the method")
         if ds.sizes["event"]:
             axes.plot([], [], color=PURPLE, linestyle=(0, (1.5, 1.5)), label="note")
 
@@ -240,6 +245,7 @@ def _values(ds: xr.Dataset) -> Table:
     for k in range(first, ds.sizes["run"]):
         value = estimate(factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]))
         remarks = [word for name, word in (("outside", "outside"), ("departing", "outlier")) if ds[name][k]]
+        remarks += [version for changed, _, version in version_changes(ds) if changed == k]
         started, run = date(ds, float(ds["time"][k])), str(ds["run"].values[k])
         rows.append([started, run, value.text, value.uncertainty, ", ".join(remarks)])
     caption = f"Values in {unit}" if unit else "Values"

@@ -32,6 +32,8 @@ class Series:
         Name of the run folder, and name of the figure in this run.
     unit : str
         SI unit.
+    versions : sequence of str
+        Method and version of each run; empty where unknown.
     """
 
     time: Array
@@ -42,6 +44,7 @@ class Series:
     runs: Sequence[str] = ()
     names: Sequence[str] = ()
     unit: str = "m"
+    versions: Sequence[str] = ()
 
     @property
     def size(self) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets.files.events import instant
+from errormotion.record.history import version_changes
 from errormotion.report.text import rounded
 
 FIELD = {"m": (1e6, "um"), "rad": (648000 / math.pi, "arcsec"), "1": (1.0, ""), "degC": (1.0, "degC")}
@@ -67,6 +68,11 @@ def sentences(ds: xr.Dataset) -> list[str]:
         found.append(
             "No significant step, with a probability of a false alarm of "
             f"{100 * float(ds.attrs['false_alarms']):.2g} %."
+        )
+    for k, before, after in version_changes(ds):
+        when = date(ds, float(ds["time"][k]))
+        found.append(
+            f"From {when} on, {before} is replaced by {after}: values before and after may differ by definition."
         )
     sure = float(ds["trend_low"]) > 0 or float(ds["trend_high"]) < 0
     found.append(f"Trend: {trend_text(ds)}{'.' if not np.isfinite(ds['trend']) or sure else ': not significant.'}")

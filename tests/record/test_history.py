@@ -22,8 +22,9 @@ from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.figures import figure_over_time
-from errormotion.record.history import history
+from errormotion.record.history import history, version_changes, violations
 from errormotion.record.runs.listing import list_runs
+from errormotion.record.text import sentences
 from errormotion.report import write_run_report
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -130,6 +131,29 @@ def test_the_step_is_named_by_the_note_between_its_runs(lab: Path, call: Callabl
     assert step["low"] <= 30 * 86400 * (BEFORE - 0.5) <= step["high"]
     assert found["trend_low"] <= 0 <= found["trend_high"]
     assert [note["text"] for note in found["notes_on_machine"]] == ["coolant off", "hit the vice"]
+
+
+def test_a_change_of_the_version_of_the_method_is_marked(tmp_path: Path, call: Callable[..., Any]) -> None:
+    runs, rng = tmp_path / "runs", np.random.default_rng(5)
+    for k in range(12):
+        end = 12e-6 + (10e-6 if k >= 6 else 0.0) + 0.3e-6 * rng.normal()
+        values = {"EX": 0.0, "EY": 0.0, "EZ": [0.0, end, end], "EA": 20e-6, "EB": 0.0, "EC": 0.0}
+        result = errors(values, ("time",), {"time": [0.0, 3600.0, 3601.0]})
+        save(runs, k, result.assign_attrs(method_version="2" if k >= 6 else "1"))
+    found = history(list_runs([runs], machine="VM1"), "VM1", "EZ")
+    assert version_changes(found) == [(6, "foreign 1", "foreign 2")]
+    assert "foreign 1 replaced by foreign 2" in str(found["step_event"].values[0])
+    assert any("foreign 1 is replaced by foreign 2" in sentence for sentence in sentences(found))
+    (row,) = [line for line in call(runs, "--figure", "EZ").splitlines() if "run-06" in line]
+    assert "foreign 2" in row
+    plain = call(runs, "--figure", "EZ", "--json")
+    assert [each["version"] for each in plain["values"]] == ["foreign 1"] * 6 + ["foreign 2"] * 6
+    page = tmp_path / "page.html"
+    call(runs, "--figure", "EZ", "--report", page)
+    assert "version of the method" in page.read_text()
+    # Figures over time that were stored before have no versions.
+    assert version_changes(found.drop_vars("version")) == []
+    assert violations(found.drop_vars("version")) == []
 
 
 def test_a_common_source_is_fully_correlated_between_a_freedom_and_a_figure_of_merit(lab: Path) -> None:

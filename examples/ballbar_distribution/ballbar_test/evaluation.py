@@ -6,6 +6,12 @@ averaged by sectors, and the offset of the common least-squares circle is subtra
 means g, with the projection P that removes cosine and sine. The radius is not removed: it compares the scales of the
 machine with the calibrated bar.
 
+The mean over a sector reduces a spike at a reversal, on the unsafe side. The figures are therefore those of a finer
+path: means over as many sectors as have about `READINGS_EACH` readings, plus the model of the path within each of them,
+with the decay of its spikes among `DECAYS` that fits the readings best. Where the model does not describe the path, a
+part of the spike is still lost. It is estimated by the change from sectors of twice the width, and contained in the
+uncertainty.
+
 Covariance: the means have independent noise S, so that ``P S P'`` is that of the deviations. Its diagonal is stated
 exactly. Between different sectors it differs from zero by at most 1/places of the variance, and it is zero orthogonal
 to cosine and sine; the sectors are therefore stated as independent, in addition to their shared sources.
@@ -17,6 +23,13 @@ import numpy as np
 
 from ballbar_test import sectors
 from ballbar_test.extremes import Figures, figures
+
+DECAYS = (1 / 12, 1 / 6, 1 / 3, 2 / 3, 1.0, 2.0)
+"""Decays of spikes relative to the setting."""
+READINGS_EACH = 3
+"""Mean number of readings in a sector of the path of the figures."""
+WITHIN = 2
+"""Parts of such a sector at which the model is evaluated."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +64,38 @@ def evaluate(circles, settings, notes):
         offset = found[1:3]
     design = sectors.sector_design(circles, settings)
     averaged = sectors.average(circles, deviation - at_readings, design @ found, settings, notes)
-    return _fit(averaged, design, notes)
+    return _fit(averaged, design, notes, _fine_figures(circles, deviation, settings))
+
+
+def _fine_figures(circles, deviation, settings):
+    """Return the figures of the finest path that the readings determine."""
+    fits = []
+    for factor in DECAYS:
+        decay = factor * settings.spike_decay
+        at_readings, found = sectors.first_model(circles, deviation, decay)
+        residual = deviation - at_readings
+        fits.append((float(np.nansum(residual**2)), decay, residual, found))
+    _, decay, residual, found = min(fits, key=lambda fit: fit[0])
+    settings = settings.model_copy(update={"spike_decay": decay})
+    readings = int(np.isfinite(residual).sum()) / 2
+    widths = [max(1, int(readings / (READINGS_EACH * settings.places)) // part) for part in (1, 2)]
+    fine, coarse = (_path_figures(circles, residual, found, settings, settings.places * each) for each in widths)
+    if widths[0] == widths[1]:
+        return fine
+    return Figures(fine.value, fine.covariance + np.diag((fine.value - coarse.value) ** 2))
+
+
+def _path_figures(circles, residual, found, settings, places):
+    """Return the figures of means over a number of sectors plus the model of the path within them."""
+    finer = settings.model_copy(update={"places": places})
+    each, inside = (
+        sectors.sector_design(circles, finer) @ found,
+        settings.model_copy(update={"places": places * WITHIN}),
+    )
+    averaged = sectors.average(circles, residual, each, finer, [])
+    shape = sectors.sector_design(circles, inside) @ found - np.repeat(each, WITHIN, axis=1)
+    shared = np.array(list(averaged.shared.values())).reshape(-1, 2, places)
+    return figures(averaged.value, averaged.u, shared, shape)
 
 
 def second_order(offset, circles):
@@ -62,7 +106,7 @@ def second_order(offset, circles):
     return np.hypot(circles.radius + along, across) - circles.radius - along
 
 
-def _fit(averaged, design, notes):
+def _fit(averaged, design, notes, of_path):
     known = np.isfinite(averaged.value)
     M, g, u = design[known], averaged.value[known], averaged.u[known]
     names, shared = list(averaged.shared), np.array([effect[known] for effect in averaged.shared.values()])
@@ -96,7 +140,7 @@ def _fit(averaged, design, notes):
         offset=to_circle[1:] @ g,
         offset_u=np.sqrt(np.diagonal(circle_covariance))[1:],
         misfit=misfit,
-        figures=figures(deviation, independent, every),
+        figures=of_path,
         averaged=averaged,
     )
 

@@ -34,6 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballbar_test.path import circle, middles
+from errormotion.datasets.results.extremes import FLAT
 
 NAMES = ("G(CCW)", "G(CW)", "G(b)", "H", "Fmax", "Fmin", "D")
 MEANINGS = (
@@ -46,9 +47,9 @@ MEANINGS = (
     "mean bi-directional radial deviation",
 )
 POSITIVE = ("G(CCW)", "G(CW)", "G(b)", "H")
-DRAWS = 1000
-FLAT, POINTED = 1 / (np.sqrt(2) - 1), 1.0
-"""Ratio of the bias of a figure to its change by additional noise of the same size, for the two shapes of a path."""
+DRAWS = 200
+POINTED = 1.0
+"""Ratio of the bias of a figure to its change by additional noise of the same size, for pointed paths."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def radius(deviation):
     return flat[..., known] @ np.linalg.pinv(design)[0]
 
 
-def figures(deviation, independent, shared):
+def figures(deviation, independent, shared, shape=None):
     """Return the figures, corrected for the bias by noise, with their covariance.
 
     Parameters
@@ -112,12 +113,20 @@ def figures(deviation, independent, shared):
         Standard uncertainty by independent noise, m.
     shared : ndarray, (source, 2, place)
         Effect of one standard uncertainty of each shared source, m.
+    shape : ndarray, (2, place * k), optional
+        Known deviation from the means within k parts of each place, m.
     """
+    shape = np.zeros(deviation.shape) if shape is None else shape
+    parts = shape.shape[-1] // deviation.shape[-1]
     draw = np.random.default_rng(0).standard_normal
     half = independent * draw((DRAWS // 2, *deviation.shape))
     half += np.tensordot(draw((DRAWS // 2, len(shared))), shared, axes=1)
-    first = evaluate(deviation)
-    again = evaluate(deviation + np.concatenate([half, -half]))  # in pairs, so that the draws cause no bias
+
+    def path(values):
+        return np.repeat(values, parts, axis=-1) + shape
+
+    first = evaluate(path(deviation))
+    again = evaluate(path(deviation + np.concatenate([half, -half])))  # in pairs, so that the draws cause no bias
     d = again.mean(axis=0) - first
     value = first - FLAT * d
     covariance = np.cov(again.T)

@@ -15,7 +15,7 @@ class Ballbar:
         id="ballbar",
         summary="Circular test after ISO 230-4 with a telescoping ballbar",
         status="simulated_only",
-        version="1",
+        version="2",
         cannot_see=(
             "errors across the bar: only the radial displacement is measured",
             "the position of the circle: its centre is that of the least-squares circle",

@@ -12,10 +12,12 @@ import numpy as np
 import xarray as xr
 
 from ballbar_test import circles, extremes, result
-from ballbar_test.path import SENSES, sector_angles, since_reversal
+from ballbar_test.path import SENSES, middles, sector_angles, since_reversal
 from ballbar_test.schema import READINGS, SCHEMA
 from errormotion.datasets import provenance
 
+PATH = 7200
+"""Angles of the true path."""
 MISSING = 0.002
 """Share of missing readings."""
 EXPANSION, EXPANSION_U, TEMPERATURE_U = 11.5e-6, 1e-6, 0.05  # 1/K, 1/K, K
@@ -53,6 +55,13 @@ class Machine:
         error += np.array(self.bow)[::-1] * (command[..., ::-1] / radius) ** 2
         error[..., 0] -= self.squareness * y
         return command * (1 + self.lobes / radius * np.cos(5 * angle))[..., None] + error
+
+    def path(self, settings):
+        """Return the true radial deviation of the path, without the offset of its circle, (2, `PATH`), m."""
+        angle = np.array([middles(PATH)] * 2)
+        sense = np.broadcast_to(np.array(list(SENSES.values()))[:, None], angle.shape)
+        position = self.position(angle, sense, settings.nominal_radius, settings.feed)
+        return extremes.centred(np.linalg.norm(position, axis=-1) - settings.nominal_radius)
 
     def deviation(self, settings):
         """Return the true mean radial deviation over each sector, without the offset of its circle, (2, place), m."""
@@ -94,7 +103,7 @@ def truth(settings, machine, seed):
         shared={},
         parameters=parameters,
         covariance=np.zeros((len(parameters),) * 2),
-        figures=result.exact(extremes.evaluate(deviation)),
+        figures=result.exact(extremes.evaluate(machine.path(settings))),
         machine="virtual machine",
         frame="machine",
         reference=result.REFERENCE,

@@ -80,7 +80,7 @@ def tests():
         found = evaluation.evaluate(circles.read(raw, []), settings, [])
         u = np.sqrt(np.diagonal(found.parameter_covariance))
         ratios["parameters"].append((found.parameters - machine.parameters) / u)
-        true = extremes.evaluate(machine.deviation(settings))
+        true = extremes.evaluate(machine.path(settings))
         ratios["figures"].append((found.figures.value - true) / found.figures.u)
     return {name: np.array(values) for name, values in ratios.items()}
 
@@ -99,6 +99,22 @@ def test_intervals_of_the_figures_hold_the_truth(tests):
     low = stats.binom.ppf(FALSE_ALARM / 7, SEEDS, 0.95)
     assert dict(zip(extremes.NAMES, held >= low, strict=True)) == dict.fromkeys(extremes.NAMES, True)
     assert (np.mean(tests["figures"] ** 2, axis=0) > 0.4).all()  # and the uncertainty is not much too large
+
+
+@pytest.mark.parametrize("decay", [1.0, 3.0])
+def test_a_spike_is_not_reduced_by_the_width_of_a_sector(decay):
+    """G, H and F of the path itself: the mean over 2 degrees of a spike of 3 degrees is a quarter smaller."""
+    settings = Ballbar.Settings()
+    machine = Machine(spike=(6e-6, 4e-6), backlash=(1e-6, 1e-6), spike_decay=np.radians(decay))
+    true = extremes.evaluate(machine.path(settings))
+    held, seeds = np.zeros(len(true)), 40
+    for seed in range(seeds):
+        raw = simulation.measure(settings, machine, np.random.default_rng(seed))
+        found = Ballbar().identify(raw, settings)
+        u = np.sqrt(np.diagonal(found["figure_covariance"].values))
+        held += np.abs(found["figures"].values - true) <= 2 * u
+    low = stats.binom.ppf(FALSE_ALARM / 7, seeds, 0.95)
+    assert dict(zip(extremes.NAMES, held >= low, strict=True)) == dict.fromkeys(extremes.NAMES, True)
 
 
 @pytest.mark.parametrize(("path", "size"), [("flat", 0.0), ("ellipse", 20.0), ("spikes", 20.0)])

@@ -15,6 +15,7 @@ from errormotion.cli.page import Page, new_files
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.errors import RunError
 from errormotion.record.history import history as followed
+from errormotion.record.history import version_changes
 from errormotion.record.runs.listing import list_runs
 from errormotion.record.text import date, field_of, sentences
 from errormotion.report.text import rounded
@@ -79,6 +80,7 @@ def _values(ds: xr.Dataset) -> str:
             factor * float(ds["value"][k]), factor * float(ds["expanded_uncertainty"][k]), signed=False, digits=2
         )
         remarks = [word for name, word in (("outside", "outside"), ("departing", "outlier")) if ds[name][k]]
+        remarks += [version for changed, _, version in version_changes(ds) if changed == k]
         shown = [value.replace("−", "-"), U, unit, ", ".join(remarks), str(run)]
         rows.append([date(ds, float(ds["time"][k])), *shown])
     head = ["started (UTC)", "value", "U (k=2)", "unit", "limits", "run"]
@@ -96,7 +98,11 @@ def as_plain(ds: xr.Dataset) -> dict[str, Any]:
         "unit": ds.attrs["unit"],
         "start": ds.attrs["start"],
         "values": [
-            {"run": str(run), **{name: float(ds[name].values[k]) for name in runs}}
+            {
+                "run": str(run),
+                "version": str(ds["version"].values[k]),
+                **{name: float(ds[name].values[k]) for name in runs},
+            }
             for k, run in enumerate(ds["run"].values)
         ],
         **{name: float(ds[name]) for name in (*scalars, "degrees")},
