@@ -18,7 +18,7 @@ from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.planning.expected import expected, planned
 from errormotion.campaign.storage.store import committed_length
-from errormotion.errors import InstrumentTimeoutError, RunError
+from errormotion.errors import BenchError, InstrumentTimeoutError, RunError
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import reset, world
 from errormotion.instruments.simulators.device import SimulatedDevice
@@ -452,8 +452,9 @@ def test_without_a_control_on_the_bench_the_operator_starts_the_warm_up_program(
 def test_a_probe_that_moves_the_machine_requires_a_control(lab: Lab) -> None:
     plan, runs = lab()
     plan = without_control(plan)
-    with pytest.raises(RunError, match=r"'controller_probe' moves the machine.*the bench has none"):
+    with pytest.raises(BenchError, match=r"'controller_probe' moves the machine.*the bench has none"):
         runner.run(plan, runs=runs)
+    assert not runs.exists()
 
 
 def test_a_plan_uses_the_noise_of_the_probe_of_the_bench(lab: Any) -> None:
