@@ -555,7 +555,10 @@ def _continuation(folder: RunFolder, test: TestPlan) -> str:
     with suppress(OSError, ErrormotionError):
         if _begun(folder, test) and (why := cannot_continue(test)):
             return why
-    return f"Continue with 'errormotion run --resume --runs {folder.path.parent}'."
+    resume = f"Continue with 'errormotion run --resume --runs {folder.path.parent}'"
+    if not folder.data["acquired"] or folder.errors is not None:
+        return f"{resume}."
+    return f"{resume}, which repeats the identification with the same settings; 'errormotion identify' takes others."
 
 
 @contextmanager

@@ -159,6 +159,29 @@ def test_an_interrupted_test_that_cannot_be_continued_does_not_advise_it(
         runner.resume(plan, runs=runs, release=released)
 
 
+@pytest.mark.parametrize(
+    ("runs", "stated", "cause"),
+    [
+        (1, "", "uncertainty.scatter and uncertainty.drift"),
+        (1, 'uncertainty = {drift = "1 um"}', "uncertainty.scatter and uncertainty.drift"),
+        (1, 'uncertainty = {drift = "1 um", scatter = "1 um"}', ""),
+        (3, "", "the setting uncertainty.drift, to estimate scatter and drift; found 3"),
+        (3, 'uncertainty = {drift = "1 um"}', ""),
+        (4, "", ""),
+    ],
+)
+def test_runs_that_cannot_be_identified_are_refused_when_the_campaign_is_read(
+    tmp_path: Path, runs: int, stated: str, cause: str
+) -> None:
+    campaign = real_bench.write(tmp_path, {"laser": "tcp://127.0.0.1:9", "control": "tcp://127.0.0.1:9"})
+    campaign.write_text(campaign.read_text().replace("runs = 5", f"runs = {runs}\n{stated}"))
+    if not cause:
+        assert load_campaign(campaign).tests
+        return
+    with pytest.raises(BenchError, match=rf"test\[0\]\.settings\.runs: expected 4 runs or more, or .*{cause}"):
+        load_campaign(campaign)
+
+
 # ---------------------------------------------------------------------- calibrations
 
 YESTERDAY = date.today() - timedelta(days=1)

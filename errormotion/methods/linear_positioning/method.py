@@ -84,6 +84,14 @@ class LinearPositioning:
 
         return planning.programs(settings) if settings.diagonals is not None else programs(settings)
 
+    def check(self, settings: PositioningSettings) -> dict[str, str]:
+        """Return that the runs cannot determine their scatter or drift, and the settings do not state them."""
+        if settings.diagonals is not None or settings.moving is not None:
+            return {}
+        from errormotion.methods.linear_positioning.identification.scatter import lacking
+
+        return lacking(settings)
+
     def check_machine(self, settings: PositioningSettings, machine: MachineDescription) -> dict[str, str]:
         """Return by setting what the machine cannot do: an axis that it does not have, targets outside its travel."""
         from errormotion.methods.linear_positioning.diagonals import planning

@@ -16,13 +16,17 @@ deviation is larger by sqrt(v / (v - 2)) (JCGM 101:2008, 6.4.9.4); the stated un
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.kinematics.iso import DOF, direction_of
+
+if TYPE_CHECKING:
+    from errormotion.methods.linear_positioning.settings import Settings
 
 DRIFTS = ("offset", "slope")
 MIN_RUNS = 4
@@ -139,6 +143,21 @@ def scatter(
         freedom=runs - 1 if runs >= MIN_RUNS else 0,
         noise=noise,
     )
+
+
+def lacking(settings: Settings) -> dict[str, str]:
+    """Return by setting what `scatter` will lack whatever is measured; only that of the positioning can be stated."""
+    stated, only = settings.uncertainty, settings.freedoms == (DOF[direction_of(settings.axis)],)
+    if settings.runs == 1:
+        if only and stated.scatter is not None and stated.drift is not None:
+            return {}
+        needed = "uncertainty.scatter and uncertainty.drift"
+    elif settings.runs >= MIN_RUNS or (only and stated.drift is not None):
+        return {}
+    else:
+        needed = "uncertainty.drift"
+    other = f", or the setting {needed}" if only else " for freedoms other than the positioning"
+    return {"runs": f"expected {MIN_RUNS} runs or more{other}, to estimate scatter and drift; found {settings.runs}"}
 
 
 def _stated(x: Array, z: Array, stated: float | None, drift: float | None, stated_drift: Array) -> Scatter:
