@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import xarray as xr
@@ -14,10 +15,21 @@ from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError, RunError
 
 
-def load(
-    paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False
-) -> tuple[dict[str, xr.Dataset], list[str]]:
-    """Return error datasets by name, and a message for each omitted run.
+@dataclass(frozen=True)
+class Loaded:
+    """Error datasets by name, the path of each on the command line, and a message for each omitted run.
+
+    ``chosen`` are the names of those that were selected from a folder of runs.
+    """
+
+    results: dict[str, xr.Dataset] = field(default_factory=dict)
+    paths: dict[str, Path] = field(default_factory=dict)
+    chosen: set[str] = field(default_factory=set)
+    omitted: list[str] = field(default_factory=list)
+
+
+def load(paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = False) -> Loaded:
+    """Return error datasets by name.
 
     Parameters
     ----------
@@ -33,27 +45,32 @@ def load(
     DatasetError, RunError
         A path does not exist or is not an error dataset, or a run has no error dataset.
     """
-    found: dict[str, xr.Dataset] = {}
-    omitted: list[str] = []
+    found = Loaded()
     for path in paths:
-        for name, file in _files(path, omitted, every):
-            _add(found, name, file)
+        of_runs = path.is_dir() and is_runs_folder(path)
+        for name, file in _files(path, found.omitted, every):
+            own = _add(found, name, file, path)
+            if of_runs:
+                found.chosen.add(own)
     for name, path in names.items():
-        files = _files(path, omitted)
+        files = _files(path, found.omitted)
         if len(files) != 1:
             raise DatasetError(f"{path}: expected one error dataset for the name '{name}'; found {len(files)}")
-        _add(found, name, files[0][1])
-    return found, omitted
+        _add(found, name, files[0][1], path)
+    return found
 
 
-def _add(found: dict[str, xr.Dataset], name: str, file: Path) -> None:
+def _add(found: Loaded, name: str, file: Path, path: Path) -> str:
+    """Add the dataset of a file, and return its name: that of the test, with a number if it is not unique."""
     own, number = name, 1
-    while own in found:
+    while own in found.results:
         number += 1
         own = f"{name} ({number})"
     with reading(file):
-        found[own] = datasets.load(file)
-        datasets.validate(found[own])
+        found.results[own] = datasets.load(file)
+        datasets.validate(found.results[own])
+    found.paths[own] = path
+    return own
 
 
 def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[str, Path]]:

@@ -74,21 +74,21 @@ def compare(
     ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
     pairs = [pair(a, b) for a, b in _pairs(ground, against)]
     by_name = {each.name: each for each in ground.estimates}
-    found: list[list[Cause]] = []
+    found: list[list[Cause] | None] = []
     for each in pairs:
         wanted = groups is None and each.joint.p < DISAGREEMENT_P / len(pairs) if causes is None else causes
-        found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else [])
+        found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else None)
     spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
     return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
 
 
 def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:
-    """Return the possible causes of the difference of two estimates on common ground."""
+    """Return the causes of the difference of two estimates on common ground that are more likely than chance."""
     time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
     records = {each.name: ground.records[each.name] for each in (a, b) if each.name in ground.records}
     courses = {name: course for name, ds in records.items() if (course := course_of(ds, ground.freedoms))}
     heat = _temperatures(datasets, ground)
-    return diagnose(a, b, ground.freedoms, time=time, temperatures=heat, turns=ground.turns, courses=courses)
+    return diagnose(a, b, ground.freedoms, ground.stored, time=time, temperatures=heat, courses=courses)
 
 
 def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:

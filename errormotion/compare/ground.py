@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.compare import chain
-from errormotion.compare.placed import Placed
+from errormotion.compare.placed import Placed, Stored
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
 from errormotion.datasets.results.interpolation import bracket
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
-from errormotion.kinematics.iso import DOF
+from errormotion.kinematics.iso import DOF, LINEAR_AXES, ROTARY_AXES, direction_of
 
 SAME_POINT = 1e-6
 """Distance below which two commanded positions are regarded as equal, m."""
@@ -48,12 +49,12 @@ class Ground:
     since : float or None
         Time of the common reference state on ``time``, s; None if the errors have no common reference in time.
     notes : list of str
-    turns : dict of str to ndarray (n, 3)
-        Rotations of each dataset that states any, rad, 0 if unknown; also if they are not compared.
     records : dict of str to Dataset
         Complete datasets over time, at the functional point and on the common time axis.
     labels : dict of str to str
         Names of sources by identity.
+    stored : dict of str to Stored
+        The errors of each dataset as a function of the errors that it states.
     """
 
     estimates: list[Estimate]
@@ -67,9 +68,9 @@ class Ground:
     since: float | None
     start: str = ""
     notes: list[str] = field(default_factory=list)
-    turns: dict[str, Array] = field(default_factory=dict)
     records: dict[str, xr.Dataset] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
+    stored: dict[str, Stored] = field(default_factory=dict)
 
 
 def common_ground(
@@ -109,10 +110,14 @@ def common_ground(
     _once(datasets)
     notes: list[str] = []
     datasets = {name: chain.in_machine(ds) for name, ds in datasets.items()}
+    stored: dict[str, Stored] = {}
+    place, straightened = "", False
     if chain.axis_of(datasets):
         _same(datasets, "machine")
         _same(datasets, "frame")
-        datasets = chain.on_axis(datasets, at=at, same_start=same_start, notes=notes)
+        datasets, stored = chain.on_axis(datasets, at=at, same_start=same_start, notes=notes)
+    else:
+        datasets, place, straightened = chain.at_reference(datasets, "", notes)
     for name, ds in datasets.items():
         _check_dimensions(name, ds)
     first = datasets[names[0]]
@@ -142,6 +147,14 @@ def common_ground(
         found = _in_place(moved, dim, notes) if dim else moved
         placed = {name: Placed.of(ds) for name, ds in found.items()}
         coords = _coordinates(next(iter(found.values())), dim)
+    if stored:
+        stored |= {name: Stored(each, np.zeros(3)) for name, each in placed.items() if name not in stored}
+    else:
+        stored = _stored(placed, datasets, point, component, coords, place)
+        if straightened:
+            placed = {name: each.line(each.placed) for name, each in stored.items()}
+            stored = {name: replace(each, finish=each.line) for name, each in stored.items()}
+            notes.append("Straightness is compared relative to the line through the first and the last position.")
     seen = [each.seen for each in placed.values()]
     chosen = tuple(name for name in (freedoms or DOF) if all(name in each for each in seen))
     for name in freedoms:
@@ -164,7 +177,7 @@ def common_ground(
         since=reference,
         start=str(first.attrs.get("start", "")),
         notes=notes,
-        turns={name: turn for name, each in placed.items() if (turn := each.turns).any()},
+        stored=stored,
         records=records,
         labels={
             identity: source
@@ -173,6 +186,37 @@ def common_ground(
             if identity
         },
     )
+
+
+def _stored(
+    placed: Mapping[str, Placed],
+    datasets: Mapping[str, xr.Dataset],
+    point: Array,
+    component: str,
+    coords: Mapping[str, xr.DataArray],
+    place: str,
+) -> dict[str, Stored]:
+    """Return the errors of each dataset as a function of the errors that it states."""
+    found = {}
+    for name, each in placed.items():
+        own = np.array(datasets[name].attrs["functional_point"], dtype=float)
+        found[name] = Stored(each, np.zeros(3) if component == "beam" else point - own)
+    if component in LINEAR_AXES and (letter := "xyz"[direction_of(component)]) in coords:
+        q = np.asarray(coords[letter].values, dtype=float)
+        line = partial(chain.from_line, positions=q, axis=component)
+        found = {
+            name: replace(each, levers=chain.levers(place, q, component), line=line) for name, each in found.items()
+        }
+    return found
+
+
+def parts_compared(component: str) -> set[str]:
+    """Return the parts of the machine with which errors of a component can be compared.
+
+    An axis is compared with the same axis, and with the tool by the kinematic chain.
+    """
+    part = SAME_MOTION.get(component, component)
+    return {part, "tool"} if part in (*LINEAR_AXES, *ROTARY_AXES) else {part}
 
 
 def _check(name: str, ds: xr.Dataset) -> None:
@@ -219,7 +263,8 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
         hint = {
             "frame": ". Transform one to the frame of the other by ds.em.in_frame(pose, name), or state the origin of "
             "its frame in machine coordinates (attribute frame_origin, --origin NAME=x,y,z)",
-            "component": ". A comparison of the errors of an axis and of the tool needs the kinematic chain",
+            "component": ". Compare those of one part of the machine; a comparison of the errors of an axis and of the "
+            "tool needs the kinematic chain",
         }.get(attribute, "")
         raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
     return values.pop()

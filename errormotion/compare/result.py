@@ -77,10 +77,10 @@ def build(
     pairs: Sequence[Pair],
     agreed: Consensus,
     robust: tuple[Array, Array, Array],
-    causes: Sequence[Sequence[Cause]],
+    causes: Sequence[Sequence[Cause] | None],
     spread: Repeats | None = None,
 ) -> xr.Dataset:
-    """Return the result of a comparison as a dataset of the schema."""
+    """Return the result of a comparison as a dataset of the schema; ``causes`` of a pair are None if not searched."""
     estimates = ground.estimates
     found: dict[str, Any] = {
         "value": np.array([each.value for each in estimates]),
@@ -101,7 +101,7 @@ def build(
         "between": robust[2],
         "misfit_p": np.array(agreed.p),
         "rest_p": np.array([each.p for each in agreed.rest]),
-        **_causes(causes),
+        **_causes([each or () for each in causes]),
     }
     single = not ground.dim
     variables = {}
@@ -137,6 +137,7 @@ def build(
         "shared_sources": json.dumps(shared(estimates)),
         "shared_names": json.dumps([ground.labels.get(key, key) for key in shared(estimates)]),
         "notes": ground.notes or [""],
+        "searched": np.array([each is not None for each in causes], dtype=int),
     }
     if ground.since is not None:
         attrs |= {"since": ground.since, "start": ground.start}

@@ -8,12 +8,15 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from errormotion.arrays import Array
+
 LIMIT = 0.05
 """Probability below which datasets contradict each other."""
 FIELD = {"m": (1e3, "mm"), "rad": (648000 / np.pi, "arcsec"), "s": (1.0, "s"), "1": (1.0, "")}
 UM_BELOW = 1e-3
 """Lengths below are printed in um (errors), others in mm (coordinates), m."""
 FIELD |= {"m/K": (1e6, "um/K"), "rad/K": (648000 / np.pi, "arcsec/K")}
+FIELD |= {"m/s": (3600e6, "um/h"), "rad/s": (3600 * 648000 / np.pi, "arcsec/h")}
 
 
 MAX_SHARED = 6
@@ -58,7 +61,7 @@ SPREAD_HEAD = ["freedom", "standard deviation", "found", "95 % interval", "state
 
 
 class CauseText(NamedTuple):
-    """One cause, as text."""
+    """One cause, as text; ``size`` is empty for a cause without a size."""
 
     name: str
     size: str
@@ -66,12 +69,25 @@ class CauseText(NamedTuple):
     p: float
     alike: str
 
+    @property
+    def sized(self) -> str:
+        """Return the cause with its size, if it has one."""
+        return f"{self.name} {self.size}" if self.size else self.name
+
 
 def probability(p: float) -> str:
     """Return a probability as text."""
     if not np.isfinite(p):
         return "unknown"
     return "< 0.0001" if p < 1e-4 else f"{p:.2g}" if p < 0.01 else f"{p:.2f}"
+
+
+def within(en: Array) -> tuple[str, str]:
+    """Return the share of normalised errors within 1, and the largest one, as text; ``unknown`` if none is known."""
+    known = np.abs(en[np.isfinite(en)])
+    if not known.size:
+        return "unknown", "unknown"
+    return f"{100 * np.mean(known <= 1):.0f} %", f"{known.max():.2f}"
 
 
 def _p(p: float) -> str:
@@ -99,15 +115,17 @@ def verdict(ds: xr.Dataset) -> list[str]:
             lines += [f"Without '{name}' the others agree." for name in alone]
         if len(names) > 2 and not alone:
             lines.append("The contradiction remains if any single dataset is left out.")
+    searched = np.atleast_1d(ds.attrs.get("searched", np.zeros(ds.sizes["pair"])))
     for j, pair in enumerate(ds["pair"].values):
         first = cause_text(ds, j, 0)
         if first is None:
-            continue
-        if first.p < 1e-3:
-            lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.name} {first.size}.")
+            if searched[j] and float(ds["p"].values[j]) < LIMIT:
+                lines.append(f"{pair}: none of the known causes explains the difference better than chance.")
+        elif first.p < 1e-3:
+            lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.sized}.")
         else:
             more = f" Indistinguishable from: {first.alike}." if first.alike else ""
-            lines.append(f"{pair}: most likely cause: {first.name}{' ' + first.size if first.size else ''}.{more}")
+            lines.append(f"{pair}: most likely cause: {first.sized}.{more}")
     if shared := _shared(ds):
         more = f" and {len(shared) - MAX_SHARED} more" if len(shared) > MAX_SHARED else ""
         lines.append(f"Treated as fully correlated between datasets: {'; '.join(shared[:MAX_SHARED])}{more}.")
@@ -131,12 +149,13 @@ def cause_text(ds: xr.Dataset, pair: int, rank: int) -> CauseText | None:
         return None
     parts = []
     for label, value, u in zip(one["size_name"].values, one["size"].values, one["size_u"].values, strict=True):
-        if str(label):
+        if str(label) and np.isfinite(value):
             what, _, unit = str(label).removesuffix(")").rpartition(" (")
             factor, field = FIELD.get(unit, (1.0, unit))
             if unit == "m" and abs(value) < UM_BELOW:
                 factor, field = 1e6, "um"
-            parts.append(f"{what} {factor * value:.4g} ± {2 * factor * u:.2g} {field}".rstrip())
+            spread = f" ± {2 * factor * u:.2g}" if np.isfinite(u) else ""
+            parts.append(f"{what} {factor * value:.4g}{spread} {field}".rstrip())
     return CauseText(
         name, ", ".join(parts), float(one["log_likelihood_ratio"]), float(one["cause_p"]), str(one["alike"].values)
     )

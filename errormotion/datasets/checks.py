@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets.files.sampling import sample, steps
-from errormotion.datasets.schemas import Row
+from errormotion.datasets.schemas import STRAIGHTNESS_REFERENCES, Row
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -200,3 +200,12 @@ def _dtype(variable: xr.Variable) -> str:
 def dims(variable: xr.Variable) -> str:
     """Return the dimensions of a variable as text."""
     return f"({', '.join(map(str, variable.dims))})"
+
+
+def straightness_reference_violations(ds: xr.Dataset) -> list[str]:
+    """Return the violation in the attribute ``straightness_reference`` of a raw or error dataset."""
+    value = ds.attrs.get("straightness_reference", STRAIGHTNESS_REFERENCES[0])
+    if isinstance(value, str) and value in STRAIGHTNESS_REFERENCES:
+        return []
+    expected = " or ".join(STRAIGHTNESS_REFERENCES)
+    return [f"attribute 'straightness_reference': expected {expected}; found {value!r}. Leave it out if unknown"]

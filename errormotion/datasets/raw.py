@@ -13,6 +13,7 @@ from errormotion.datasets.checks import (
     magnitude_violations,
     number,
     storable_violations,
+    straightness_reference_violations,
     time_violations,
 )
 from errormotion.datasets.schemas import RawSchema, Row, variants
@@ -41,7 +42,7 @@ def raw_violations(ds: xr.Dataset, raw: RawSchema) -> list[str]:
 
     Large variables are checked in samples distributed over the record; they are never loaded completely.
     """
-    found = storable_violations(ds)
+    found = [*storable_violations(ds), *straightness_reference_violations(ds)]
     for dim, size in raw.sizes.items():
         if dim in ds.sizes and ds.sizes[dim] != size and dim not in raw.labels:
             found.append(f"dimension {dim}: expected {size}; found {ds.sizes[dim]}")

@@ -226,10 +226,15 @@ OPTIONAL_ATTRIBUTES = {
     "lever_axes": "linear axes whose travel is a lever of the rotations, such as `Z`, if the errors are not those "
     "of one rigid motion: the displacement at another point is `E + R x r` along these directions only, and EA, EB "
     "and EC are rotations of the frame of the axes",
+    "straightness_reference": "of a linear axis: `table` if its straightness is read at a point that is fixed to the "
+    "table, `tool` if it is read at a point that is fixed to the tool; missing: unknown",
 }
 """Attributes that an error dataset may have."""
 
-CARRIED = ("chain", "operator", "certificates")
+STRAIGHTNESS_REFERENCES = ("table", "tool")
+"""Values of the attribute ``straightness_reference`` of raw and error datasets."""
+
+CARRIED = ("chain", "operator", "certificates", "straightness_reference")
 """Attributes of a raw dataset that are copied to its error dataset."""
 
 
@@ -267,6 +272,7 @@ __all__ = [
     "READING",
     "SCHEMA",
     "SIGN",
+    "STRAIGHTNESS_REFERENCES",
     "UNIT_VECTOR",
     "XYZ",
     "RawSchema",

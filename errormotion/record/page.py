@@ -65,7 +65,7 @@ def part(ds: xr.Dataset, key: str) -> Part:
 def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
     factor, unit = field_of(ds)
     last = estimate(factor * float(ds["value"][-1]), factor * float(ds["expanded_uncertainty"][-1]))
-    per_year = unit + "/year"
+    per_year = f"{unit or 1}/year"
     trend, low, high = (factor * float(ds[name]) for name in ("trend", "trend_low", "trend_high"))
     slope = estimate(trend, (high - low) / 2, reason="fewer than three times")
     coverage = f"{100 * float(ds.attrs['coverage']):.0f} % interval ± {slope.uncertainty}" if slope.uncertainty else ""

@@ -48,9 +48,8 @@ def trend_text(ds: xr.Dataset) -> str:
     factor, unit = field_of(ds)
     low, high = float(ds["trend_low"]), float(ds["trend_high"])
     ends = [rounded(factor * each, factor * (high - low) / 2)[0] for each in (float(ds["trend"]), low, high)]
-    return (
-        f"{ends[0]} {unit} per year, {100 * float(ds.attrs['coverage']):.0f} % interval {ends[1]} to {ends[2]} {unit}"
-    )
+    slope, end = (f"{each} {unit}".rstrip() for each in (ends[0], ends[2]))
+    return f"{slope} per year, {100 * float(ds.attrs['coverage']):.0f} % interval {ends[1]} to {end}"
 
 
 def sentences(ds: xr.Dataset) -> list[str]:

@@ -44,6 +44,9 @@ class Drawn:
     factor: float = 1.0
     start: str = START
     mapping: np.ndarray = field(default_factory=lambda: np.eye(6))  # from measured to stated values
+    point: np.ndarray = field(default_factory=lambda: np.zeros(3))  # functional point of values and sources
+    targets: np.ndarray | None = None  # (n, 3) instead of times
+    component: str = "tool"
 
     def dataset(self, rng: np.random.Generator | None, shared: Mapping[str, float] | None = None) -> xr.Dataset:
         """Return the dataset, drawn with a generator or exact without one; ``shared`` sources are given."""
@@ -63,17 +66,19 @@ class Drawn:
         return datasets.build_errors(
             values @ A.T,
             A @ np.diag(noise**2) @ A.T + np.einsum("sti,stj->tij", F, F),
-            dims=("time",),
-            coords={"time": self.time, **(recorded if self.temperature.size else {})},
+            dims=("time",) if self.targets is None else ("target",),
+            coords={"time": self.time, **(recorded if self.temperature.size else {})}
+            if self.targets is None
+            else {name: ("target", self.targets[:, k]) for k, name in enumerate("xyz")},
             influence=F,
             sources=names,
             source_groups=names,
             source_ids=dict(self.ids),
             start=self.start,
-            component="tool",
+            component=self.component,
             machine="virtual gantry",
             frame="machine",
-            functional_point=(0, 0, 0),
+            functional_point=self.point,
             reference="cold",
             method=self.name,
             method_version="1",

@@ -141,7 +141,7 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
     ground = common_ground(sets)
     causes = explain(*ground.estimates, sets, ground)
     planted = next(cause.score for cause in causes if _same(cause.name, mistake.cause))
-    return planted - max(cause.score for cause in causes if not _same(cause.name, mistake.cause))
+    return planted - max([0.0, *(cause.score for cause in causes if not _same(cause.name, mistake.cause))])
 
 
 def one(task: tuple[int, int, float, float]) -> dict:

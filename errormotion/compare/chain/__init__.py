@@ -8,16 +8,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, products
 from errormotion.compare.chain.curve import Curve, measured, reference_weights
+from errormotion.compare.chain.straightness import TABLE, TOOL, at_reference, from_line, levers
 from errormotion.compare.chain.volume import SAME, predict
+from errormotion.compare.placed import Placed, Stored
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import between, later
 from errormotion.errors import DatasetError
 from errormotion.kinematics.chains import parse_chain
 from errormotion.kinematics.iso import LINEAR_AXES, ROTARY_AXES
 
-__all__ = ["axis_of", "in_machine", "on_axis", "predict"]
+__all__ = ["at_reference", "axis_of", "from_line", "in_machine", "levers", "on_axis", "predict"]
 
 
 def axis_of(datasets: Mapping[str, xr.Dataset]) -> str:
@@ -30,8 +32,10 @@ def axis_of(datasets: Mapping[str, xr.Dataset]) -> str:
 
 def on_axis(
     datasets: Mapping[str, xr.Dataset], *, at: ArrayLike | None = None, same_start: bool = False, notes: list[str]
-) -> dict[str, xr.Dataset]:
+) -> tuple[dict[str, xr.Dataset], dict[str, Stored]]:
     """Return all datasets as errors of one axis, at common positions, relative to the same positions.
+
+    The second mapping relates those of the axis to the errors that they state.
 
     Parameters
     ----------
@@ -55,12 +59,16 @@ def on_axis(
     for name, ds in volumes.items():
         _check_volume(name, ds, axis)
     point = np.array(first.attrs["functional_point"] if at is None else at, dtype=float)
-    axes = {}
+    axes, shifts = {}, {}
     for name, ds in datasets.items():
         if name in volumes:
             continue
         _check_reference(name, ds, first_name, first)
         axes[name] = _at_instant(name, ds, first_name, first, same_start, notes).em.at(point)
+        shifts[name] = point - np.asarray(ds.attrs["functional_point"], dtype=float)
+    # The errors of an axis are stated at a point of the body that moves.
+    place = TOOL if parse_chain(str(first.attrs["chain"]))[axis] else TABLE
+    axes, _, _ = at_reference(axes, place, notes)
     letter = axis.lower()
     positions = _common_positions(axes, volumes, letter)
     found: dict[str, Curve] = {}
@@ -75,10 +83,34 @@ def on_axis(
         f"{positions.size} positions. Positioning and rotations are relative to the first, straightness to the line "
         "through the first and the last: squareness, datum and constant parts are not compared."
     )
-    return {
+
+    def relative(each: Placed) -> Placed:
+        return _placed(_curve(each).relative(weights))
+
+    stored = {
+        name: Stored(
+            _placed(found[name]),
+            shift,
+            finish=relative,
+            levers=levers(place, positions, axis) if axis in LINEAR_AXES else {},
+        )
+        for name, shift in shifts.items()
+    }
+    placed = {
         name: _dataset(datasets[name], curve.relative(weights), axis, positions, point, first)
         for name, curve in found.items()
     }
+    return placed, stored
+
+
+def _placed(curve: Curve) -> Placed:
+    total = curve.own + products(curve.influence)
+    return Placed(curve.value, total, curve.influence, curve.source, curve.identity)
+
+
+def _curve(each: Placed) -> Curve:
+    own = each.total - products(each.influence)
+    return Curve(each.value, own, each.influence, each.source, [""] * len(each.source), each.identity)
 
 
 def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:

@@ -1,18 +1,21 @@
-"""Possible causes, with their effect on the difference of two datasets."""
+"""Possible causes of a difference, by family, with their effect on two datasets."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from errormotion.arrays import Array
-from errormotion.compare.consensus import consensus
 from errormotion.compare.diagnosis.shift import Course, smooth
+from errormotion.compare.placed import Placed, Stored
 from errormotion.compare.stack import Estimate
 from errormotion.kinematics.iso import DOF
+from errormotion.kinematics.twists import adjoint
 
 MAX_STEPS = 60
 """Largest number of times at which a step is tested."""
@@ -28,183 +31,282 @@ TURNS = {
     "degrees taken as radians": 180 / np.pi,
     "radians taken as degrees": np.pi / 180,
 }
+FRAMES = ("roll of the frame (about X)", "pitch of the frame (about Y)", "yaw of the frame (about Z)")
+SENSOR = {"X": ("EX", "EB", "EC"), "Y": ("EY", "EA", "EC"), "Z": ("EZ", "EA", "EB")}
+"""Freedoms that a sensor along each axis affects, by its position relative to the functional point."""
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A cause with sizes: effects (p, n, d) of one unit of each size, and its name and unit.
+class Side:
+    """One of the two datasets: its estimate, the errors that it states, and its sign in the difference."""
 
-    ``choices`` are the sets of sizes that may differ from zero simultaneously: a wrong tool length changes one of the
-    three coordinates of a functional point, a holder expands along one axis.
+    given: Estimate
+    stored: Stored
+    sign: float
+    freedoms: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the dataset."""
+        return self.given.name
+
+    def estimate(self, placed: Placed) -> Estimate:
+        """Return errors on common ground as an estimate of the compared freedoms."""
+        return placed.estimate(self.name, self.freedoms)
+
+    def corrected(self, A: Array) -> Estimate:
+        """Return the estimate if the stated errors are multiplied by matrices."""
+        return self.estimate(self.stored.changed(A))
+
+
+@dataclass(frozen=True)
+class Added:
+    """A cause whose effects (p, n, d) are added to a difference: one unit of each size, with its name and unit.
+
+    ``choices`` are the sets of sizes that may differ from zero simultaneously; ``kind`` is common to the trials of a
+    search over time, of which there are ``tries``.
     """
 
+    family: str
     name: str
     effects: Array
     labels: tuple[tuple[str, str], ...]
-    tries: int = 1  # number of trials of a search over time
-    kind: str = ""  # kind of the search
-    choices: tuple[tuple[int, ...], ...] = ()
+    choices: tuple[tuple[int, ...], ...]
+    tries: int = 1
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A cause that changes the errors that one dataset states, at its own functional point.
+
+    ``matrix`` returns the correction (6, 6) for sizes; without ``labels`` it has none. ``size`` converts the parameters
+    of ``matrix`` with their standard uncertainties to sizes. ``stretched`` freedoms are multiplied by the matrix.
+    """
+
+    family: str
+    name: str
+    side: Side
+    matrix: Callable[[Array], Array]
+    labels: tuple[tuple[str, str], ...] = ()
+    choices: tuple[tuple[int, ...], ...] = ((),)
+    size: Callable[[Array, Array], tuple[Array, Array]] = lambda value, u: (value, u)
+    stretched: bool = False
+
+
+@dataclass(frozen=True)
+class Read:
+    """A straightness that was read at another point; both estimates before and after the correction, and its effect."""
+
+    family: str
+    name: str
+    before: tuple[Estimate, Estimate]
+    after: tuple[Estimate, Estimate]
+    effect: Estimate
 
 
 @dataclass(frozen=True)
 class Shifted:
     """A shift in time: smoothed errors of the first dataset (sign 1) or of the second one (-1)."""
 
+    family: str
     course: Course
     sign: float
     time: Array
 
 
-@dataclass(frozen=True)
-class Corrected:
-    """A cause without a size: the estimates after its correction."""
-
-    name: str
-    a: Estimate
-    b: Estimate
-    stretch: Array | None = None  # (d,) factors by which the freedoms of one estimate were multiplied
+AnyCause = Added | Mapped | Read | Shifted
 
 
 def candidates(
-    a: Estimate,
-    b: Estimate,
-    freedoms: Sequence[str],
-    time: Array | None,
-    temperatures: Mapping[str, Array],
-    turns: Mapping[str, Array],
-    courses: Mapping[str, Course],
-) -> Iterator[Candidate | Corrected | Shifted]:
-    """Yield every cause that can be tested with two estimates."""
-    mean = _six(np.nan_to_num(consensus([a, b]).estimate.value), freedoms)
-    k = [DOF.index(name) for name in freedoms]
-    yield from _geometric(mean, k)
-    if not set(DOF[3:]) <= set(freedoms):
-        for each in (a, b):
-            if each.name in turns:
-                yield from _functional_point(turns[each.name], k, f"functional point of '{each.name}'")
-    yield from _scales(mean, k, freedoms)
-    yield from _fixed(a, b, freedoms)
-    n = len(a.value)
-    units = tuple((name, "m" if name in DOF[:3] else "rad") for name in freedoms)
-    choices = _freedom_sets(freedoms)
-    yield Candidate("constant difference (reference state)", _columns(np.ones(n), len(k)), units, choices=choices)
+    a: Side, b: Side, time: Array | None, temperatures: Mapping[str, Array], courses: Mapping[str, Course]
+) -> Iterator[AnyCause]:
+    """Yield every cause that can be tested with two datasets."""
+    yield from _functional_points(a, b)
+    yield from _frames(a, b)
+    yield from _scales(a, b)
+    yield from _signs(a, b)
+    yield from _exchanges(a, b)
+    yield from _units(a, b)
+    yield from _straightness(a, b)
+    n = len(a.given.value)
+    yield from _profile(a, b, np.ones(n), "reference state", "constant difference (reference state)")
     if time is not None and n > 2:
         yield from _shift(a, b, time, courses)
-        yield from _steps(n, units, time, choices)
+        yield from _steps(a, b, time)
+        yield from _profile(a, b, time - time[0], "drift of a sensor", "drift of a sensor (linear in time)", per="/s")
     for name, temperature in temperatures.items():
         change = temperature - temperature[0]
         if np.ptp(change) > 0:
-            labels = tuple((label, f"{unit}/K") for label, unit in units)
-            yield Candidate(f"expansion with {name}", _columns(change, len(k)), labels, choices=choices)
+            yield from _profile(a, b, change, "expansion", f"expansion with {name}", per="/K")
 
 
-def _shift(a: Estimate, b: Estimate, time: Array, courses: Mapping[str, Course]) -> Iterator[Shifted]:
+def _places(a: Side, b: Side, of: str = "of") -> list[tuple[Side, str]]:
+    """Return the datasets whose mistakes differ, with the end of the name of a cause.
+
+    At one functional point a mistake in one of them has the same effect as the inverse one in the other.
+    """
+    if np.array_equal(a.stored.shift, b.stored.shift):
+        return [(a, "")]
+    return [(each, f" {of} '{each.name}'") for each in (a, b)]
+
+
+def _functional_points(a: Side, b: Side) -> Iterator[Mapped]:
+    compared = set(DOF[3:]) <= set(a.freedoms)
+    for side, name in (
+        [(a, "functional point")] if compared else [(each, f"functional point of '{each.name}'") for each in (a, b)]
+    ):
+        effects = [_effect(side, adjoint(shift=axis) - np.eye(6)) for axis in np.eye(3)]
+        used = [axis for axis in range(3) if np.abs(effects[axis]).max(initial=0.0) > 0]
+        if not used:
+            continue
+
+        def matrix(r: Array, used: list[int] = used) -> Array:
+            shift = np.zeros(3)
+            shift[used] = -r
+            return adjoint(shift=shift)
+
+        together = tuple(range(len(used)))
+        choices = tuple(dict.fromkeys([*((i,) for i in together), together]))
+        labels = tuple(("XYZ"[axis], "m") for axis in used)
+        yield Mapped("functional point", name, side, matrix, labels, choices)
+
+
+def _frames(a: Side, b: Side) -> Iterator[Mapped]:
+    for side, suffix in _places(a, b):
+        for axis, name in enumerate(FRAMES):
+
+            def matrix(angle: Array, axis: int = axis) -> Array:
+                return adjoint(rotation=Rotation.from_rotvec(-angle[0] * np.eye(3)[axis]))
+
+            yield Mapped("orientation of the frame", name + suffix, side, matrix, (("angle", "rad"),), ((0,),))
+
+
+def _scales(a: Side, b: Side) -> Iterator[Mapped]:
+    for side, suffix in _places(a, b):
+        parts = {"the displacements": DOF[:3], "the rotations": DOF[3:]} | {name: (name,) for name in _stated(side)}
+        for what, names in parts.items():
+            inside = np.isin(DOF, names)
+            if np.abs(_effect(side, np.diag(inside.astype(float)))).max(initial=0.0) > 0:
+
+                def matrix(gain: Array, inside: NDArray[np.bool_] = inside) -> Array:
+                    return np.diag(np.where(inside, 1.0 + gain[0], 1.0))
+
+                labels = (("factor - 1", "1"),)
+                name = f"scale of {what}{suffix}"
+                yield Mapped("scale", name, side, matrix, labels, ((0,),), _factor, stretched=True)
+
+
+def _factor(gain: Array, u: Array) -> tuple[Array, Array]:
+    """Return the factor minus 1 of a dataset whose errors must be multiplied by ``1 + gain``."""
+    return 1 / (1 + gain) - 1, u / (1 + gain) ** 2
+
+
+def _signs(a: Side, b: Side) -> Iterator[Mapped]:
+    for side, suffix in _places(a, b):
+        for name in _stated(side):
+            turned = np.diag(np.where(np.isin(DOF, name), -1.0, 1.0))
+            yield Mapped("sign", f"sign of {name}{suffix}", side, _always(turned))
+
+
+def _exchanges(a: Side, b: Side) -> Iterator[Mapped]:
+    for side, suffix in _places(a, b, "in"):
+        for names in (DOF[:3], DOF[3:]):
+            for one, other in combinations([name for name in names if name in _stated(side)], 2):
+                i, j = DOF.index(one), DOF.index(other)
+                swap = np.eye(6)
+                swap[[i, j]] = swap[[j, i]]
+                yield Mapped("exchanged axes", f"{one} and {other} exchanged{suffix}", side, _always(swap))
+
+
+def _units(a: Side, b: Side) -> Iterator[Mapped]:
+    for names, factors in ((DOF[:3], FACTORS), (DOF[3:], TURNS)):
+        for side in (a, b):
+            if not set(names) & set(_stated(side)):
+                continue
+            for what, factor in factors.items():
+                back = np.diag(np.where(np.isin(DOF, names), 1 / factor, 1.0))
+                yield Mapped("unit", f"unit of '{side.name}': {what}", side, _always(back), stretched=True)
+
+
+def _straightness(a: Side, b: Side) -> Iterator[Read]:
+    for side in (a, b):
+        for place, lever in side.stored.levers.items():
+            before = tuple(each.estimate(each.stored.line(each.stored.changed(np.eye(6)))) for each in (a, b))
+            moved = side.estimate(side.stored.line(side.stored.changed(adjoint(shift=lever))))
+            after = (moved, before[1]) if side is a else (before[0], moved)
+            name = f"straightness of '{side.name}' read at a point of the {place}"
+            effect = side.estimate(side.stored.line(side.stored.changed(adjoint(shift=lever) - np.eye(6))))
+            yield Read("reference of the straightness", name, (before[0], before[1]), after, effect)
+
+
+def _shift(a: Side, b: Side, time: Array, courses: Mapping[str, Course]) -> Iterator[Shifted]:
     found = {
-        sign: courses.get(each.name) or smooth(time, each.value, np.sqrt(np.diagonal(each.own, axis1=1, axis2=2)))
-        for each, sign in ((a, 1.0), (b, -1.0))
+        each.sign: courses.get(each.name)
+        or smooth(time, each.given.value, np.sqrt(np.diagonal(each.given.own, axis1=1, axis2=2)))
+        for each in (a, b)
     }
     known = {sign: course for sign, course in found.items() if course is not None}
     if known:
         sign = max(known, key=lambda sign: known[sign].instants)
-        yield Shifted(known[sign], sign, time)
+        yield Shifted("shift in time", known[sign], sign, time)
 
 
-def _geometric(E: Array, k: list[int]) -> Iterator[Candidate]:
-    shift, turn = E[:, :3], E[:, 3:]
-    yield from _functional_point(turn, k, "functional point")
-    for axis, name in enumerate(
-        ("roll of the frame (about X)", "pitch of the frame (about Y)", "yaw of the frame (about Z)")
-    ):
-        rotated = np.concatenate([np.cross(np.eye(3)[axis], part) for part in (shift, turn)], axis=1)
-        yield Candidate(name, rotated[None][:, :, k], (("angle", "rad"),))
-
-
-def _functional_point(turn: Array, k: list[int], name: str) -> Iterator[Candidate]:
-    if np.abs(turn).max(initial=0.0) > 0:
-        lever = np.zeros((3, len(turn), 6))
-        for axis in range(3):
-            lever[axis, :, :3] = np.cross(turn, np.eye(3)[axis])
-        used = [axis for axis in range(3) if np.abs(lever[axis][:, k]).max() > 0]
-        labels = tuple(("XYZ"[axis], "m") for axis in used)
-        together = tuple(range(len(used)))
-        choices = tuple(dict.fromkeys([*((i,) for i in together), together]))
-        yield Candidate(name, lever[used][:, :, k], labels, choices=choices)
-
-
-def _scales(E: Array, k: list[int], freedoms: Sequence[str]) -> Iterator[Candidate]:
-    for name, part in (("displacements", slice(0, 3)), ("rotations", slice(3, 6))):
-        scaled = np.zeros_like(E)
-        scaled[:, part] = E[:, part]
-        if np.abs(scaled[:, k]).max(initial=0.0) > 0:
-            yield Candidate(f"scale of the {name}", scaled[None][:, :, k], (("factor - 1", "1"),))
-    for freedom in freedoms:
-        scaled = np.zeros_like(E)
-        scaled[:, DOF.index(freedom)] = E[:, DOF.index(freedom)]
-        yield Candidate(f"scale of {freedom}", scaled[None][:, :, k], (("factor - 1", "1"),))
-
-
-def _fixed(a: Estimate, b: Estimate, freedoms: Sequence[str]) -> Iterator[Corrected]:
-    """Yield causes without a size: a sign, exchanged axes, a unit of one dataset."""
-    d = len(freedoms)
-    for j, name in enumerate(freedoms):
-        sign = np.eye(d)
-        sign[j, j] = -1.0
-        yield Corrected(f"sign of {name}", a, _mapped(b, sign))
-    for names in (DOF[:3], DOF[3:]):
-        for one, other in combinations(names, 2):
-            if one in freedoms and other in freedoms:
-                order = list(freedoms)
-                i, j = order.index(one), order.index(other)
-                swap = np.eye(d)
-                swap[[i, j]] = swap[[j, i]]
-                yield Corrected(f"{one} and {other} exchanged", a, _mapped(b, swap))
-    for names, factors in ((DOF[:3], FACTORS), (DOF[3:], TURNS)):
-        inside = np.array([name in names for name in freedoms])
-        if not inside.any():
-            continue
-        for what, factor in factors.items():
-            back = np.diag(np.where(inside, 1 / factor, 1.0))
-            for wrong in (a, b):
-                pair = (_mapped(a, back), b) if wrong is a else (a, _mapped(b, back))
-                yield Corrected(f"unit of '{wrong.name}': {what}", *pair, stretch=np.diag(back))
-
-
-def _mapped(each: Estimate, A: Array) -> Estimate:
-    """Return an estimate whose freedoms are transformed by a matrix with one entry per row; NaN remains NaN."""
-    value = np.nan_to_num(each.value) @ A.T
-    gone = (np.abs(A) @ np.isnan(each.value).T.astype(float)).T > 0
-    value[gone] = np.nan
-    return replace(
-        each, value=value, own=A @ np.nan_to_num(each.own) @ A.T, influence=np.nan_to_num(each.influence) @ A.T
-    )
-
-
-def _steps(
-    n: int, units: tuple[tuple[str, str], ...], time: Array, choices: tuple[tuple[int, ...], ...]
-) -> Iterator[Candidate]:
+def _steps(a: Side, b: Side, time: Array) -> Iterator[Added]:
     """Yield a step at each time: an object was moved or struck."""
+    n = time.size
     indices = np.unique(np.linspace(2, max(n - 2, 2), max(min(n - 3, MAX_STEPS), 0)).astype(int)).tolist()
     for i in indices:
         after = np.where(np.arange(n) >= i, 1.0, 0.0)
         name = f"step at {time[i]:.0f} s (something moved)"
-        yield Candidate(name, _columns(after, len(units)), units, tries=len(indices), kind="step", choices=choices)
+        yield from _profile(a, b, after, "step", name, tries=len(indices), kind="step")
 
 
-def _columns(profile: Array, d: int) -> Array:
-    """Return the effects of one size for each freedom with the same profile, (d, n, d)."""
-    found: Array = np.einsum("n,ij->inj", profile, np.eye(d))
-    return found
+def _profile(
+    a: Side, b: Side, profile: Array, family: str, name: str, *, per: str = "", tries: int = 1, kind: str = ""
+) -> Iterator[Added]:
+    """Yield errors with one profile (n,), in some of the freedoms that a dataset states."""
+    places = _places(a, b)
+    for side, suffix in places:
+        names = _stated(side)
+        columns = side.stored.transfer[
+            np.ix_([DOF.index(each) for each in side.freedoms], [DOF.index(n) for n in names])
+        ]
+        seen = [j for j in range(len(names)) if np.abs(columns[:, j]).max() > 0]
+        names = [names[j] for j in seen]
+        effects = np.einsum("n,ij->jni", profile, columns[:, seen])
+        labels = tuple((each, ("m" if each in DOF[:3] else "rad") + per) for each in names)
+        choices = _freedom_sets(names)
+        if suffix:  # a displacement has the same effect in both
+            turning = {j for j, each in enumerate(names) if each in DOF[3:]}
+            plain = tuple(each for each in choices if not turning & set(each))
+            choices = tuple(each for each in choices if turning & set(each))
+            if side is a and plain:
+                yield Added(family, name, effects, labels, plain, tries, kind)
+        if choices:
+            yield Added(family, name + suffix, effects, labels, choices, tries, kind and kind + suffix)
 
 
-def _six(values: Array, freedoms: Sequence[str]) -> Array:
-    found = np.zeros((len(values), 6))
-    for column, name in enumerate(freedoms):
-        found[:, DOF.index(name)] = np.nan_to_num(values[:, column])
-    return found
-
-
-def _freedom_sets(freedoms: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Return the sets of freedoms that a cause may affect: one, all displacements, all rotations, or all."""
-    parts = [tuple(i for i, name in enumerate(freedoms) if name in names) for names in (DOF[:3], DOF[3:], DOF)]
-    singles = [(i,) for i in range(len(freedoms))]
+def _freedom_sets(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the sets of freedoms that a cause may affect: one, those of a sensor along an axis, or of a body."""
+    parts = [
+        tuple(i for i, name in enumerate(names) if name in part) for part in (*SENSOR.values(), DOF[:3], DOF[3:], DOF)
+    ]
+    singles = [(i,) for i in range(len(names))]
     return tuple(dict.fromkeys([*singles, *(part for part in parts if part)]))
+
+
+def _stated(side: Side) -> list[str]:
+    """Return the freedoms that a dataset states and that affect the compared ones."""
+    k = [DOF.index(name) for name in side.freedoms]
+    acts = np.abs(side.stored.transfer[k]).max(axis=0) > 0
+    return [name for name, each in zip(DOF, acts, strict=True) if each and name in side.stored.placed.seen]
+
+
+def _effect(side: Side, A: Array) -> Array:
+    """Return the effect (n, d) of a matrix on the compared freedoms of a dataset; unknown values have none."""
+    return np.nan_to_num(side.corrected(A).value)
+
+
+def _always(A: Array) -> Callable[[Array], Array]:
+    return lambda _: A

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.compare.report.picture import abscissa, common, field, height, paint
-from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
+from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict, within
 from errormotion.report.canvas import WIDTH, draw
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text
 from errormotion.report.page.language import texts_of
@@ -44,15 +44,18 @@ def part(ds: xr.Dataset, key: str) -> Part:
 
 
 def _key_figures(ds: xr.Dataset) -> list[KeyFigure]:
-    largest = float(np.nanmax(np.abs(ds["en"].values))) if np.isfinite(ds["en"].values).any() else float("nan")
+    birge = float(ds.attrs["birge_ratio"])
     return [
         KeyFigure(
             "Agreement of all datasets", Cell(probability(float(ds.attrs["fit_p"]))), "", "joint chi-square test"
         ),
         KeyFigure(
-            "Birge ratio", Cell(f"{float(ds.attrs['birge_ratio']):.2f}"), "", "1 if the uncertainties are consistent"
+            "Birge ratio",
+            Cell(f"{birge:.2f}" if np.isfinite(birge) else "unknown"),
+            "",
+            "1 if the uncertainties are consistent",
         ),
-        KeyFigure("Largest |En|", Cell(f"{largest:.2f}"), "", "k = 2"),
+        KeyFigure("Largest |En|", Cell(within(ds["en"].values)[1]), "", "k = 2"),
     ]
 
 
@@ -83,9 +86,12 @@ def _pair_tables(ds: xr.Dataset) -> list[Table]:
     rows: list[Sequence[Cell | str]] = []
     single: list[Sequence[Cell | str]] = []
     for j, name in enumerate(ds["pair"].values):
-        inside = np.abs(ds["en"].values[j])
-        inside = 100 * float(np.mean(inside[np.isfinite(inside)] <= 1)) if np.isfinite(inside).any() else float("nan")
-        row = [str(name), f"{inside:.0f} %", f"{ds['chi2'].values[j]:.1f}", f"{ds['degrees'].values[j]:.0f}"]
+        row = [
+            str(name),
+            within(ds["en"].values[j])[0],
+            f"{ds['chi2'].values[j]:.1f}",
+            f"{ds['degrees'].values[j]:.0f}",
+        ]
         rows.append([*row, probability(ds["p"].values[j])])
         single.append([str(name), *(probability(p) for p in ds["curve_p"].values[j])])
     whole = Table(

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-import numpy as np
 import xarray as xr
 from tornado.web import HTTPError
 
 from errormotion.compare import compare
 from errormotion.compare.report import write as write_comparison
-from errormotion.compare.text import cause_text, probability, verdict
+from errormotion.compare.text import cause_text, probability, verdict, within
 from errormotion.dashboard.cache import Cache, stamp
 from errormotion.dashboard.figures import comparison_item
 from errormotion.dashboard.lab import Choice, Lab
@@ -182,14 +181,12 @@ def _stated(ds: xr.Dataset) -> dict[str, Any]:
     """Return the results of a comparison as text for the page."""
     names, pairs = [str(name) for name in ds["dof"].values], []
     for j, pair in enumerate(ds["pair"].values):
-        en = np.abs(ds["en"].values[j])
-        share = f"{100 * np.mean(en[np.isfinite(en)] <= 1):.0f} %" if np.isfinite(en).any() else "unknown"
         p = [probability(float(each)) for each in (ds["p"].values[j], *ds["curve_p"].values[j])]
         causes = [cause_text(ds, j, rank) for rank in range(min(ds.sizes["rank"], MAX_CAUSES))]
         pairs.append(
             {
                 "name": str(pair),
-                "cells": [share, f"{np.nanmax(en, initial=0.0):.2f}", *p],
+                "cells": [*within(ds["en"].values[j]), *p],
                 "causes": [each for each in causes if each is not None],
             }
         )

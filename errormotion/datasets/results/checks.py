@@ -26,6 +26,7 @@ from errormotion.datasets.checks import (
     magnitude_violations,
     number,
     storable_violations,
+    straightness_reference_violations,
     time_violations,
     unit_violations,
 )
@@ -188,7 +189,7 @@ def _machine_violations(ds: xr.Dataset) -> list[str]:
     axes = ds.attrs.get("lever_axes", "Z")
     if axes not in _LEVERS:
         found.append(f"attribute 'lever_axes': expected one of {', '.join(_LEVERS)}; found {axes!r}")
-    return found
+    return found + straightness_reference_violations(ds)
 
 
 _LEVERS = ("X", "Y", "Z", "XY", "XZ", "YZ", "XYZ")

@@ -42,7 +42,7 @@ def run(
     """
     files = new_files(page)
     limited = None if tolerances is None else load_tolerances(tolerances)
-    results, _ = load([], {"before": before, "after": after})
+    results = load([], {"before": before, "after": after}).results
     stated = Stated([], [], {}, None, over=over, select=select)
     results = {name: over_one(name, ds, stated) for name, ds in results.items()}
     found = effect(results["before"], results["after"], at=at, freedoms=freedoms, since=since, tolerances=limited)

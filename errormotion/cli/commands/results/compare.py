@@ -14,16 +14,18 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.cli.output import show, show_json, table, working
 from errormotion.cli.page import Page, new_files
-from errormotion.cli.results import load
+from errormotion.cli.results import Loaded, load
 from errormotion.compare import compare as compared
+from errormotion.compare.ground import parts_compared
 from errormotion.compare.repeats import labels
-from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict
+from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict, within
+from errormotion.datasets.schemas import STRAIGHTNESS_REFERENCES
 from errormotion.errors import DatasetError
 
 
 @dataclass(frozen=True)
 class Stated:
-    """Options on the results: names, changes, origins of frames (m), chain, grouping, dims."""
+    """Options on the results: names, changes, origins of frames (m), chain, grouping, dims, straightness."""
 
     names: list[str]
     changes: list[str]
@@ -32,6 +34,7 @@ class Stated:
     by: str | None = None
     over: str | None = None
     select: Sequence[str] = ()
+    straightness: Sequence[str] = ()
 
 
 def compare(
@@ -53,9 +56,12 @@ def compare(
         The datasets cannot be read or compared, or a file already exists.
     """
     files = new_files(page, out)
-    results, left_out = load(paths, _named(stated.names), every=stated.by is not None)
-    results = _completed(results, stated)
+    loaded = load(paths, _named(stated.names), every=stated.by is not None)
+    results, left_out = _of_one_part(loaded, _completed(loaded.results, stated))
+    left_out += loaded.omitted
     results = {name: over_one(name, ds, stated) for name, ds in results.items()}
+    if not freedoms and loaded.chosen >= set(results):
+        freedoms = _of_one_body(results, left_out)
     groups = _groups(results, stated.by)
     with working(f"Comparing {len(results)} results"):
         found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
@@ -78,6 +84,42 @@ def compare(
     return found
 
 
+def _of_one_part(loaded: Loaded, results: dict[str, xr.Dataset]) -> tuple[dict[str, xr.Dataset], list[str]]:
+    """Return the results of one part of the machine, and a note on each that was chosen from a folder and is left out.
+
+    Raises
+    ------
+    DatasetError
+        A result that was named is of another part than the others.
+    """
+    part = {name: parts_compared(str(ds.attrs["component"])) for name, ds in results.items()}
+    most = max(part.values(), key=lambda each: sum(other & each != set() for other in part.values()), default=set())
+    others = [name for name, each in part.items() if not each & most]
+    kept = [name for name in results if name not in others]
+    if not others or len(kept) < 2:
+        return results, []
+    named = [name for name in others if name not in loaded.chosen]
+    if named:
+        shown = "; ".join(f"'{name}': {results[name].attrs['component']}" for name in results)
+        places = dict.fromkeys(str(loaded.paths[name]) for name in kept if name in loaded.paths)
+        raise DatasetError(
+            f"The results are of different parts of the machine ({shown}). Compare those of one part: "
+            f"errormotion compare {' '.join(places)}"
+        )
+    return {name: results[name] for name in kept}, [
+        f"omitted: '{name}', whose component '{results[name].attrs['component']}' differs from that of the others."
+        for name in others
+    ]
+
+
+def _of_one_body(results: dict[str, xr.Dataset], notes: list[str]) -> list[str]:
+    """Return the displacements that all results state if their rotations are of different bodies, else nothing."""
+    if len({str(ds.attrs.get("lever_axes", "XYZ")) for ds in results.values()}) < 2:
+        return []
+    notes.append("The rotations are those of different bodies (attribute lever_axes): only displacements are compared.")
+    return [name for name in datasets.DOF[:3] if all(np.isfinite(ds[name]).any() for ds in results.values())]
+
+
 def _named(names: list[str]) -> dict[str, Path]:
     found = {}
     for each in names:
@@ -89,19 +131,27 @@ def _named(names: list[str]) -> dict[str, Path]:
 
 
 def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.Dataset]:
-    """Return the results with the changes, frame origins and the chain of the command line."""
+    """Return the results with what the command line states about them."""
     found = dict(results)
     for each in stated.changes:
         name, _, paths = each.partition("=")
         parts = [part for part in paths.split(",") if part]
         if not name or len(parts) != 2:
             raise DatasetError(f"--change {each}: expected NAME=AFTER,BEFORE, as in --change volume=warm.nc,cold.nc")
-        both, _ = load([], {"after": Path(parts[0]), "before": Path(parts[1])})
+        both = load([], {"after": Path(parts[0]), "before": Path(parts[1])}).results
         found[name] = both["after"].em.change_from(both["before"])
     if unmatched := [name for name in stated.origins if name not in found]:
         raise DatasetError(f"--origin {unmatched[0]}: expected the name of a result: {', '.join(found)}")
     for name, origin in stated.origins.items():
         found[name] = found[name].assign_attrs(frame_origin=np.array(origin))
+    for each in stated.straightness:
+        name, _, place = each.rpartition("=")
+        if name not in found or place not in STRAIGHTNESS_REFERENCES:
+            raise DatasetError(
+                f"--straightness {each}: expected NAME={' or NAME='.join(STRAIGHTNESS_REFERENCES)}, with the name of a "
+                f"result: {', '.join(found)}"
+            )
+        found[name] = found[name].assign_attrs({"straightness_reference": place} | found[name].attrs)
     if stated.chain is not None:
         found = {name: ds.assign_attrs({"chain": stated.chain} | ds.attrs) for name, ds in found.items()}
     return found
@@ -145,10 +195,8 @@ def text(ds: xr.Dataset) -> str:
     names = [str(name) for name in ds["dof"].values]
     rows = []
     for j, pair in enumerate(ds["pair"].values):
-        en = np.abs(ds["en"].values[j])
-        share = 100 * np.mean(en[np.isfinite(en)] <= 1) if np.isfinite(en).any() else np.nan
         p = [probability(each) for each in (ds["p"].values[j], *ds["curve_p"].values[j])]
-        rows.append([str(pair), f"{share:.0f} %", f"{np.nanmax(en, initial=0.0):.2f}", *p])
+        rows.append([str(pair), *within(ds["en"].values[j]), *p])
     head = ["pair", "|En| <= 1", "max |En|", "p", *(f"p {name}" for name in names)]
     notes = [note for note in ds.attrs["notes"] if note]
     spread = [list(row) for row in spreads(ds)]

@@ -49,7 +49,7 @@ def export(
         raise DatasetError(f"{out}: expected a name that ends in {', '.join(FORMS)}")
     if out.exists():
         raise DatasetError(f"{out}: already exists, and is not replaced; give another name")
-    found, _ = load([result], {})
+    found = load([result], {}).results
     if len(found) != 1:
         names = ", ".join(found) or "none"
         raise DatasetError(f"{result}: expected one result, a run folder or a NetCDF file; found {names}")

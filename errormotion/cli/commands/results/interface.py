@@ -135,6 +135,13 @@ def compare(
         typer.Option(help="Origin of the frame of a result in machine coordinates with all axes at zero, mm."),
     ] = None,
     chain: Annotated[str | None, typer.Option(help="Kinematic chain, for results that do not state it.")] = None,
+    straightness: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=PLACE",
+            help="Where the straightness of a result was read, table or tool, if it does not state it.",
+        ),
+    ] = None,
     by: Annotated[
         Literal["test", "operator", "instrument", "method"] | None,
         typer.Option(
@@ -155,7 +162,7 @@ def compare(
     for each in origin or []:
         result, _, text = each.rpartition("=")
         origins[result] = options.point(f"--origin {result}", text)
-    stated = command.Stated(name or [], change or [], origins, chain, by, over, select or [])
+    stated = command.Stated(name or [], change or [], origins, chain, by, over, select or [], straightness or [])
     point, page = options.optional_point("--at", at), page_of(report, pdf, paper, language)
     command.compare(results or [], stated, point, options.parts(freedoms), since, same_start, out, page, json_)
 
