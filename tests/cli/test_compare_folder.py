@@ -25,7 +25,7 @@ def result(name, component, rng, *, known="EX EY EZ EA EB", **more):
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    """Run folders of beams, of a bar, and of a probing on a machine whose table moves, as a demonstration writes them."""
+    """Run folders of beams, of a bar, and of a probing on a machine whose table moves, as a demonstration writes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     rng = np.random.default_rng(1)

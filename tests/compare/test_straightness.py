@@ -139,6 +139,11 @@ def test_the_attribute_is_carried_from_raw_data_and_checked():
     raw, _ = LinearPositioning().simulate(settings, seed=1)
     found = LinearPositioning().identify(raw.assign_attrs(straightness_reference="tool"), settings)
     assert found.attrs["straightness_reference"] == "tool"
+    assert "straightness_reference" not in LinearPositioning().identify(raw, settings).attrs
+    stated = settings.model_copy(update={"straightness_reference": "table"})
+    assert LinearPositioning().identify(raw, stated).attrs["straightness_reference"] == "table"
+    with_both = LinearPositioning().identify(raw.assign_attrs(straightness_reference="tool"), stated)
+    assert with_both.attrs["straightness_reference"] == "tool"  # the data precede the settings
     with pytest.raises(DatasetError, match="attribute 'straightness_reference': expected table or tool; found 'bed'"):
         datasets.validate(raw.assign_attrs(straightness_reference="bed"))
     errors = read(VirtualMachine("cframe", seed=1), "X", "tool")

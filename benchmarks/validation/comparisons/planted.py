@@ -135,12 +135,15 @@ def planned(mistake: Mistake) -> tuple[float, float]:
 
 
 def margin(mistake: Mistake, size: float, factor: float) -> float:
-    """Return the difference of the scores of the planted cause and of the next one, without noise."""
+    """Return the difference of the scores of the planted cause and of the next one, without noise.
+
+    NaN if the planted cause is not named: a curve of the size of its noise is not significant without the noise.
+    """
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
     ground = common_ground(sets)
     causes = explain(*ground.estimates, sets, ground)
-    planted = next(cause.score for cause in causes if _same(cause.name, mistake.cause))
+    planted = next((cause.score for cause in causes if _same(cause.name, mistake.cause)), float("nan"))
     return planted - max([0.0, *(cause.score for cause in causes if not _same(cause.name, mistake.cause))])
 
 
@@ -218,10 +221,11 @@ def _row(mistake: Mistake, size: float, factor: float, ahead: float, runs: list[
     wrong = Counter(_short(run["cause"]) for run in hits if not _same(run["cause"], mistake.cause))
     alike = Counter(_short(name) for run in first for name in run["alike"])
     scale, unit = mistake.unit
+    shown = f"{ahead:+.0f}" if np.isfinite(ahead) else "-"
     right, alike_too = len(first) / max(len(hits), 1), len(named) / max(len(hits), 1)
     return (
         f"| {mistake.name} | {f'{scale * size:.3g} {unit}' if unit else '-'} | {factor:.3g} | "
-        f"{np.mean([run['predicted'] for run in runs]):.0%} | {len(hits) / len(runs):.0%} | {ahead:+.0f} | "
+        f"{np.mean([run['predicted'] for run in runs]):.0%} | {len(hits) / len(runs):.0%} | {shown} | "
         f"{right:.0%} | {alike_too:.0%} | {_most(wrong)} | {_most(alike)} |"
     )
 

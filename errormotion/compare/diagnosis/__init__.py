@@ -99,13 +99,17 @@ class _Difference:
 
 @dataclass(frozen=True)
 class _Found:
-    """A fitted cause: gain, penalty of its sizes and choices, probability of the residuals."""
+    """A fitted cause: gain, penalty of its sizes and choices, probability of the residuals.
+
+    ``change`` is the change of one dataset by the correction, with the covariance that its own noise gives it.
+    """
 
     name: str
     sizes: tuple[Size, ...]
     gain: float
     penalty: float
     p: float
+    change: Estimate | None = None
 
 
 def diagnose(
@@ -156,7 +160,8 @@ def diagnose(
         prior = 2 * np.log(members[candidate.family] * len(members))
         score = float(found.gain - found.penalty - prior)
         kind = _kind(candidate)
-        if score > 0 and (kind not in by_kind or score > by_kind[kind].score):
+        best = by_kind[kind].score if kind in by_kind else 0.0
+        if score > best and (found.change is None or _significant(found.change)):
             by_kind[kind] = Cause(found.name, found.sizes, found.gain / 2, score, found.p)  # the best one of a search
     causes = sorted(by_kind.values(), key=lambda each: -each.score)
     return [_with_alike(cause, causes) for cause in causes]
@@ -208,23 +213,22 @@ def _mapped(candidate: Mapped, given: _Difference) -> _Found | None:
     if state is None:
         return None
     if not every:
-        if not _significant(_effect(candidate, state.beta)):
-            return None
-        return _Found(candidate.name, (), state.gain, 0.0, _p(state.white.degrees, state.rest))
+        p = _p(state.white.degrees, state.rest)
+        return _Found(candidate.name, (), state.gain, 0.0, p, _change(candidate, state.beta))
     used: list[int] = []
     for _ in range(SELECTIONS):
         # The covariance at the sizes found decides which of them differ from 0.
         normal, gradient = _normal(candidate, state, range(every))
         best = _best(normal, gradient + normal @ state.beta, candidate.choices, given.count)
-        if best is None:
-            return None
+        if best is None or best[3] <= _penalty(len(best[0]), len(candidate.choices), given.count):
+            return None  # an effect without part in the difference, whatever its size
         if best[0] == used:
             break
         used = best[0]
         state = _refined(candidate, given, used)
     normal, _ = _normal(candidate, state, used)
     solved = _sizes(normal, np.zeros(len(used)))
-    if solved is None or not _significant(_effect(candidate, state.beta)):
+    if solved is None or np.abs(state.beta).max() > candidate.most:
         return None
     u = np.sqrt(np.diag(solved[1]))
     values, u = candidate.size(state.beta[used], u)
@@ -233,7 +237,8 @@ def _mapped(candidate: Mapped, given: _Difference) -> _Found | None:
         for i, value, each in zip(used, values, u, strict=True)
     )
     penalty = _penalty(len(used), len(candidate.choices), given.count)
-    return _Found(candidate.name, sizes, state.gain, penalty, _p(state.white.degrees - len(used), state.rest))
+    p = _p(state.white.degrees - len(used), state.rest)
+    return _Found(candidate.name, sizes, state.gain, penalty, p, _change(candidate, state.beta))
 
 
 def _refined(candidate: Mapped, given: _Difference, used: Sequence[int]) -> _Corrected:
@@ -253,15 +258,15 @@ def _refined(candidate: Mapped, given: _Difference, used: Sequence[int]) -> _Cor
     return state
 
 
-def _effect(candidate: Mapped, beta: Array) -> Estimate:
+def _change(candidate: Mapped, beta: Array) -> Estimate:
     """Return the change of the dataset by a correction, with the covariance that its own noise gives it."""
     side = candidate.side
     return side.estimate(side.stored.changed(candidate.matrix(beta) - np.eye(6)))
 
 
-def _significant(effect: Estimate) -> bool:
-    white = whitener(effect.own, effect.influence)
-    return white.degrees > 0 and _p(white.degrees, white.square(effect.value)) < SIGNIFICANT
+def _significant(change: Estimate) -> bool:
+    white = whitener(change.own, change.influence)
+    return white.degrees > 0 and _p(white.degrees, white.square(change.value)) < SIGNIFICANT
 
 
 @dataclass(frozen=True)
@@ -318,14 +323,12 @@ def _improved(
     return None
 
 
-def _read(candidate: Read) -> _Found | None:
-    if not _significant(candidate.effect):
-        return None
+def _read(candidate: Read) -> _Found:
     before, after = difference(*candidate.before), difference(*candidate.after)
     first, second = (whitener(each.own, each.influence) for each in (before, after))
     rest = second.square(after.value)
     gain = first.square(before.value) - rest + first.log_determinant - second.log_determinant
-    return _Found(candidate.name, (), gain, 0.0, _p(second.degrees, rest))
+    return _Found(candidate.name, (), gain, 0.0, _p(second.degrees, rest), candidate.change)
 
 
 def _shifted(candidate: Shifted, given: _Difference) -> _Found | None:

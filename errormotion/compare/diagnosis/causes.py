@@ -32,6 +32,8 @@ TURNS = {
     "radians taken as degrees": np.pi / 180,
 }
 FRAMES = ("roll of the frame (about X)", "pitch of the frame (about Y)", "yaw of the frame (about Z)")
+LARGEST_TURN = 0.5
+"""Largest error of the orientation of a frame, rad; larger ones are signs and exchanged axes."""
 SENSOR = {"X": ("EX", "EB", "EC"), "Y": ("EY", "EA", "EC"), "Z": ("EZ", "EA", "EB")}
 """Freedoms that a sensor along each axis affects, by its position relative to the functional point."""
 
@@ -82,6 +84,7 @@ class Mapped:
 
     ``matrix`` returns the correction (6, 6) for sizes; without ``labels`` it has none. ``size`` converts the parameters
     of ``matrix`` with their standard uncertainties to sizes. ``stretched`` freedoms are multiplied by the matrix.
+    ``most`` is the largest parameter.
     """
 
     family: str
@@ -92,17 +95,18 @@ class Mapped:
     choices: tuple[tuple[int, ...], ...] = ((),)
     size: Callable[[Array, Array], tuple[Array, Array]] = lambda value, u: (value, u)
     stretched: bool = False
+    most: float = np.inf
 
 
 @dataclass(frozen=True)
 class Read:
-    """A straightness that was read at another point; both estimates before and after the correction, and its effect."""
+    """A straightness that was read at another point; both estimates before and after the correction, and its change."""
 
     family: str
     name: str
     before: tuple[Estimate, Estimate]
     after: tuple[Estimate, Estimate]
-    effect: Estimate
+    change: Estimate
 
 
 @dataclass(frozen=True)
@@ -179,7 +183,9 @@ def _frames(a: Side, b: Side) -> Iterator[Mapped]:
             def matrix(angle: Array, axis: int = axis) -> Array:
                 return adjoint(rotation=Rotation.from_rotvec(-angle[0] * np.eye(3)[axis]))
 
-            yield Mapped("orientation of the frame", name + suffix, side, matrix, (("angle", "rad"),), ((0,),))
+            yield Mapped(
+                "orientation of the frame", name + suffix, side, matrix, (("angle", "rad"),), ((0,),), most=LARGEST_TURN
+            )
 
 
 def _scales(a: Side, b: Side) -> Iterator[Mapped]:

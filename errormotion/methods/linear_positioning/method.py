@@ -175,11 +175,11 @@ class LinearPositioning:
 
         checked = checked_raw(raw, self)
         settings = settings or PositioningSettings()
-        if "cycle" in checked.dims:
-            return identify_moving(checked, settings, self.info)
         if "diagonal" in checked.dims:
             return identify_diagonals(checked, settings, self.info)
-        return identify(checked, settings, self.info)
+        found = (identify_moving if "cycle" in checked.dims else identify)(checked, settings, self.info)
+        place = settings.straightness_reference
+        return found.assign_attrs({"straightness_reference": place} | found.attrs) if place else found
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""

@@ -183,6 +183,11 @@ class Settings(PluginSettings):
         default=None,
         description="point whose displacement is measured, with the axis at zero; used if the data do not state it",
     )
+    straightness_reference: Literal["table", "tool"] | None = Field(
+        default=None,
+        description="whether the point at which a straightness is read is fixed to the table or to the tool; used if "
+        "the data do not state it; default unknown",
+    )
 
     # Evaluation
     scatter: Literal["auto", "pooled", "target"] = Field(
