@@ -415,7 +415,7 @@ def shdr_lines(data: bytes) -> None:
                 continue
             for observed in found:
                 memory.store(observed)
-    each(lambda: None, *(lambda key=key: memory.numbers(key) for key in memory.values))
+    each(lambda: None, *(lambda key=key: memory.numbers(key, {}) for key in memory.values))
     memory.reported("FAULT")
 
 
