@@ -7,6 +7,9 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
+NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
+"""Flag by which a link is not opened; systems without it have no links that others can place."""
+
 
 def state_folder() -> Path:
     """Return ``errormotion`` in the user's state folder (``XDG_STATE_HOME``, else ``~/.local/state``)."""
@@ -31,9 +34,14 @@ def own_folder(*names: str) -> Path:
     return folder.joinpath(*names)
 
 
+def is_private(found: os.stat_result) -> bool:
+    """Return whether a file belongs to this user and no other user has rights to it; true on systems without modes."""
+    return not hasattr(os, "geteuid") or (found.st_uid == os.geteuid() and not found.st_mode & 0o077)
+
+
 def close_to_others(path: Path) -> None:
     """Remove all rights of other users to a file or folder of this user; a link is not followed."""
     with suppress(OSError):
         found = path.lstat()
-        if not stat.S_ISLNK(found.st_mode) and found.st_uid == os.geteuid() and found.st_mode & 0o077:
+        if not stat.S_ISLNK(found.st_mode) and not is_private(found) and found.st_uid == os.geteuid():
             path.chmod(stat.S_IMODE(found.st_mode) & ~0o077)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import CompensationError
-from errormotion.state import own_folder, state_folder
+from errormotion.state import NO_FOLLOW, is_private, own_folder, state_folder
 
 KEY, FOLDER = "audit.key", "audit"
 KEY_BYTES = 32
@@ -116,10 +116,10 @@ def _read(path: Path) -> Anchor | None:
 
 
 def _read_key(path: Path) -> bytes:
-    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    handle = os.open(path, os.O_RDONLY | NO_FOLLOW)
     with os.fdopen(handle, "rb") as file:
         found = os.fstat(handle)
-        if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        if not stat.S_ISREG(found.st_mode) or not is_private(found):
             raise ValueError(f"found mode {stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}")
         key = bytes.fromhex(file.read(4 * KEY_BYTES).decode("ascii"))
     if len(key) != KEY_BYTES:
@@ -128,7 +128,7 @@ def _read_key(path: Path) -> bytes:
 
 
 def _write(path: Path, content: bytes, *, sync: bool) -> None:
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_FOLLOW, 0o600)
     with os.fdopen(handle, "wb") as file:
         file.write(content)
         file.flush()

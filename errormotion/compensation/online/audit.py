@@ -30,6 +30,7 @@ from errormotion.compensation.online.anchors import Anchor
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import sync
 from errormotion.errors import CompensationError
+from errormotion.state import NO_FOLLOW
 
 START = "0" * 64
 """Hash before the first line."""
@@ -44,6 +45,8 @@ _LINE = re.compile(
     r'((?:"log":"([0-9a-f]{32})","key":"([0-9a-f]{16})",)?(?:"end":(\d{1,15}),)?)"entry":(.*)\}\n',
     re.DOTALL,
 )
+
+_FLUSH = getattr(os, "fdatasync", os.fsync)
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +119,7 @@ class AuditLog:
         self._log = self._reader.log or secrets.token_hex(16)
         self._count, self._hash = self._reader.count, self._reader.hash
         self._synced, self._saved = time.monotonic(), -1
-        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | NO_FOLLOW, 0o600)
         try:
             sync(path.parent)  # the name of a new file
             self._sync()
@@ -162,7 +165,7 @@ class AuditLog:
 
     def _sync(self) -> None:
         """Wait until the entries are on the disk, then store their number: it never exceeds that of the file."""
-        os.fdatasync(self._file)
+        _FLUSH(self._file)
         self._synced = time.monotonic()
         if self._saved == self._count:
             return
