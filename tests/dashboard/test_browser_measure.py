@@ -145,3 +145,39 @@ def test_a_campaign_is_corrected_planned_run_stopped_resumed_and_continues_after
     page.locator("iframe").scroll_into_view_if_needed()
     expect(page.frame_locator("iframe").locator("h1")).to_have_text("Thermal drift of the spindle")
     assert page.evaluate("window.taken") is None
+
+
+@pytest.mark.timeout(400)
+def test_the_motions_of_a_real_machine_are_released_on_the_page(
+    page: Any, accessible: Callable[[], None], mortal: tuple[Any, str, str], tmp_path: Path
+) -> None:
+    expect, runs = sync_api.expect, tmp_path / "runs"
+    bench = MEASURING.replace("{markup}", "").replace("sim://cframe/controller?seed=3", "tcp://127.0.0.1:9")
+    (tmp_path / "bench.toml").write_text(bench)
+    (tmp_path / "drift.toml").write_text(CAMPAIGN.replace("{markup}", "Real"))
+    _, address, token = mortal
+    page.expected_errors = ("403", "400")
+    page.goto(address + "measure")
+    page.fill("#token", token)
+    page.keyboard.press("Enter")
+    page.click("nav >> text=Measure")
+    expect(page.locator("#count")).to_have_text("The campaign has no mistakes.")
+    page.click("#plan")
+    page.wait_for_selector(".planned img", timeout=120_000)
+    page.click("#start")
+    expect(page.locator("#motions li")).to_contain_text("the machine will move: spindle up to 15000 /min (no limit)")
+    accessible()
+    page.fill("#typed", "yes")
+    page.keyboard.press("Enter")
+    expect(page.locator("#wrong")).to_contain_text("expected the word 'move'")
+    assert page.locator("#release-card").is_hidden()
+    page.click("#start")
+    page.click("#unreleased")
+    assert page.locator("#release-card").is_hidden()
+    assert processes.found(runs) == []
+    page.click("#start")
+    page.fill("#typed", "move")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#ended .process:has(.failed)", timeout=120_000)  # nothing answers at the address
+    assert page.locator("#release-card").is_hidden()
+    assert len(processes.found(runs)) == 1
