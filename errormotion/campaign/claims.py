@@ -28,6 +28,7 @@ from uuid import uuid4
 from errormotion.campaign.addresses import EXEMPT, is_line, same_device, scheme_of, urls
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan
 from errormotion.errors import RunError
+from errormotion.state import own_folder, state_folder
 
 try:
     import fcntl
@@ -337,9 +338,9 @@ def _folder() -> tuple[Path | None, str]:
         if _is_shared(place):
             other = f"{FOLDERS[0]} cannot be used; the claims of the instruments are in {place}."
             return Path(place), "" if place == FOLDERS[0] else other
-    own = _state_folder() / "claims"
+    own = state_folder() / "claims"
     try:
-        own.mkdir(parents=True, exist_ok=True)
+        own_folder("claims")
     except OSError as error:
         none = f"No folder for claims of the instruments can be used ({', '.join(FOLDERS)}, {own}: {error.strerror})."
         return None, f"{none} Whether another program uses the instruments is not known."
@@ -367,18 +368,13 @@ def _is_shared(place: str) -> bool:
     return right and os.access(place, os.W_OK | os.X_OK)
 
 
-def _state_folder() -> Path:
-    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(base) / "errormotion"
-
-
 def _use(machine: str, device: BenchInstrument | BenchCompensator, role: Role) -> list[Use]:
     name = device.name if isinstance(device, BenchInstrument) else "the offset output"
     found = []
     for url in urls(device):
         same, own = same_device(url), role
         if scheme_of(url) in EXEMPT or not same:  # of this process, or of this user
-            same = f"{_state_folder()}|{machine}|{device.driver.info.id}|{url}"
+            same = f"{state_folder()}|{machine}|{device.driver.info.id}|{url}"
             own = "show" if url else role
         elif is_line(url):
             own = "measure"
