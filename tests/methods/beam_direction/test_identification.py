@@ -12,6 +12,7 @@ from errormotion.kinematics.beams import tilt
 from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
 from errormotion.methods.beam_direction.identification.direction import bound
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
+from errormotion.methods.beam_direction.identification.slopes import fit_plane_readings
 from errormotion.twin import VirtualMachine
 
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
@@ -388,3 +389,47 @@ def test_speckle_without_its_length_is_refused(machine):
 
 def test_an_unknown_kind_of_stage_is_refused(machine):
     refused(simulation.raw(machine, FOUR, seed=0).assign_attrs(moves="table"), "expected 'sensor' or 'target'")
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("share", [0.1, 0.15, 0.25])
+def test_readings_with_long_tails_give_a_beam_that_holds_or_are_refused(machine, share, seed):
+    raw = simulation.raw(machine, FOUR[:3], seed=seed, inclination_error=False, speckle=seed % 2 == 0)
+    rng = np.random.default_rng(seed + 100)
+    distance = raw["distance"].values.copy()
+    wrong = rng.random(distance.shape) < share
+    distance[wrong] += 1e-6 * rng.standard_t(1, wrong.sum())
+    try:
+        errors = identify(raw.assign(distance=(raw["distance"].dims, distance, raw["distance"].attrs)))
+    except MethodError as refusal:
+        said = str(refusal)
+    else:
+        u = np.sqrt(np.diag(errors["covariance"].values[0]))
+        assert (np.abs(twist_error(errors, machine)) < 4.5 * u).all()
+        return
+    assert "do not fit a plane" in said
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.15, 308), (0.25, 35), (0.25, 368)])
+def test_readings_that_are_outliers_by_turns_are_no_internal_error(share, seed):
+    """These readings are left out by one fit and return in the next one, without an end."""
+    rng = np.random.default_rng(seed)
+    stage = 8e-3 * np.concatenate([np.outer(np.linspace(-1, 1, 20), line) for line in np.eye(3)])
+    distance = stage @ [0.3, 0.2, -1.0] + 1e-7 * rng.normal(size=60)
+    wrong = rng.random(60) < share
+    distance[wrong] += 1e-6 * rng.standard_t(1, wrong.sum())
+    fit = fit_plane_readings(distance, stage, 1e-7, 0.0, 50e-6)
+    assert np.array_equal(np.isfinite(fit.whitened), ~fit.left_out)
+    assert fit.gradient == pytest.approx([0.3, 0.2, -1.0], abs=5 * float(np.sqrt(fit.covariance.diagonal()[:3].max())))
+
+
+def test_an_outlier_beyond_the_calibrated_range_is_ignored_like_any_other(machine, calibration):
+    raw = simulation.raw(machine, FOUR, seed=0).drop_vars("reading_range")
+    distance = raw["distance"].values.copy()
+    distance[1, 7] = 25e-3  # the calibration reaches to 10 mm
+    errors = identify(
+        raw.assign(distance=(raw["distance"].dims, distance, raw["distance"].attrs)), compensation=calibration
+    )
+    assert "Plane 2: 1 readings are outliers and were ignored: reading 8." in notes(errors)
+    assert np.isnan(errors["distance_compensated"].values[1, 7])
+    assert (np.abs(twist_error(errors, machine)) < 4 * np.sqrt(np.diag(errors["covariance"].values[0]))).all()

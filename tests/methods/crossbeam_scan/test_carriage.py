@@ -8,7 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from errormotion.kinematics.twists import transform
 from errormotion.methods.crossbeam_scan.identification import chain, strain
-from errormotion.methods.crossbeam_scan.identification.carriage import Rig, carriage
+from errormotion.methods.crossbeam_scan.identification.carriage import Rig, carriage, cold_influence
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registrations import QUALITY, Registrations
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
@@ -217,3 +217,14 @@ def test_guide_that_the_carriage_does_not_follow_causes_errors(gantry, rig):
         pitch[guide] = np.abs(found.values - truth)[2, :, 3] / u[2, :, 3]
     assert pitch[None].max() < 4
     assert pitch[1e-6].min() > 4
+
+
+def test_cold_scans_never_influence_more_than_the_variance(gantry):
+    """One freedom is known a million times better than the others, and the whole noise is that of the cold scan."""
+    size = np.array([1e-9, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])
+    found = registrations(true_maps(gantry.crossbeam))
+    found = replace(found, cold_share=np.ones_like(found.cold_share))
+    covariance = np.tile(np.diag(size**2), (*found.cold_share.shape, 1, 1))
+    shared = np.sum(cold_influence(covariance, found) ** 2, axis=0)
+    assert np.all(shared <= size**2 * (1 + 1e-12))
+    assert np.allclose(shared, size**2, rtol=1e-6)

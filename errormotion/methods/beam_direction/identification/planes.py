@@ -164,7 +164,7 @@ def determine(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Determin
     else:
         notes += sensor.notes
         converged = converge(planes, data.nominal_direction, sensor, settings.tolerance, settings.max_iterations)
-    corrected = _corrected(data, converged, sensor, settings, notes)
+    corrected = _corrected(data, fits, converged, sensor, settings, notes)
     compensated = converged.planes
     origin = locate(
         converged.direction, compensated.offsets, compensated.covariances, data.points, data.point_uncertainty
@@ -314,13 +314,22 @@ def _note_origin(data: Readings, origin: Origin | None, notes: list[str]) -> Non
 
 
 def _corrected(
-    data: Readings, converged: Converged, sensor: Sensor | None, settings: Settings, notes: list[str]
+    data: Readings,
+    fits: list[PlaneFit],
+    converged: Converged,
+    sensor: Sensor | None,
+    settings: Settings,
+    notes: list[str],
 ) -> Array:
-    """Return the compensated readings (plane, reading), m; tilts that are not calibrated are refused, or noted."""
+    """Return the compensated readings (plane, reading), m; tilts that are not calibrated are refused, or noted.
+
+    Outliers, which are not used, have none.
+    """
     if sensor is None or converged.tilt is None:
         return data.raw
     values = []
-    for name, reading, tilt in zip(data.names, data.distance, converged.tilt, strict=True):
+    for name, distance, fit, tilt in zip(data.names, data.distance, fits, converged.tilt, strict=True):
+        reading = np.where(fit.left_out, np.nan, distance)
         try:
             value = sensor.calibration.compensate(reading, tilt, sensor.mid_range).value
         except MethodError as error:

@@ -118,6 +118,11 @@ def fit_plane_readings(
         if (kept == used).all():
             break
         used = kept
+    else:  # readings at the limit are left out and back by turns: the last choice counts
+        solution, covariance, whitened = _generalised(
+            design[used], distance[used], stage[used], noise, speckle, speckle_length, name
+        )
+        residual = distance - design @ solution
     if used.sum() < max(MIN_USED * valid, UNKNOWNS):
         raise MethodError(
             f"{name}: {valid - used.sum()} of {valid} readings do not fit a plane. Check that positions and readings "

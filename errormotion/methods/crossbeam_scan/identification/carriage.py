@@ -132,7 +132,7 @@ def carriage(found: Registrations, positions: ArrayLike, rig: Rig, *, guide: flo
         plus, minus = np.split(_errors(maps, gain, to_twist, to_carriage), 2)
         influence[:, c, used] = (plus - minus) / 2
     covariance = transform_covariance(C, A)
-    cold = _cold_influence(covariance, found)
+    cold = cold_influence(covariance, found)
     names = [f"cold scan {k + 1}, part {i + 1}" for k in range(artefacts) for i in range(6)]
     return Carriage(
         profiler=e,
@@ -169,15 +169,21 @@ def _errors(maps: Array, gain: Array, to_twist: Array, to_carriage: Array) -> Ar
     return np.asarray(guided @ to_carriage.mT)
 
 
-def _cold_influence(covariance: Array, found: Registrations) -> Array:
+_REGULAR = 1e-9
+"""What is added to the diagonal of correlations, above their rounding and below that of the check of results."""
+
+
+def cold_influence(covariance: Array, found: Registrations) -> Array:
     """Return the influence (6 per artefact, cycle, artefact, 6) of the cold scans' noise: one draw for all cycles."""
     cycles, artefacts = found.cold_share.shape
     out = np.where(np.isfinite(covariance[..., 0])[None], 0.0, np.nan) * np.ones((6 * artefacts, 1, 1, 1))
-    unit = np.array([1e-6] * 3 + [1e-6] * 3)
     for c, k in np.ndindex(cycles, artefacts):
-        C = covariance[c, k] / np.outer(unit, unit)
-        if np.isfinite(C).all() and C.any():
-            factor = np.linalg.cholesky(C + 1e-12 * np.trace(C) * np.eye(6))
+        unit = np.sqrt(np.diag(covariance[c, k]))
+        if np.isfinite(unit).all() and unit.all():
+            # Of the correlations, whose diagonal stays 1: a freedom that is a million times more certain than others
+            # would otherwise get more than its variance.
+            near = covariance[c, k] / np.outer(unit, unit) + _REGULAR * np.eye(6)
+            factor = np.linalg.cholesky(near / (1.0 + _REGULAR))
             out[6 * k : 6 * k + 6, c, k] = np.sqrt(found.cold_share[c, k]) * unit * factor.T
     return out
 

@@ -166,8 +166,13 @@ def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | No
     }
     if beams is not None:
         found = beams.sel(beam=list(CHANNELS))
-        origin, direction = found["beam_origin"].values, found["beam_direction"].values
-        variables["beam_covariance"] = (("channel", "p", "p_"), found["beam_covariance"].values)
+        origin, direction = (
+            found[name].transpose("beam", "direction").values for name in ("beam_origin", "beam_direction")
+        )
+        variables["beam_covariance"] = (
+            ("channel", "p", "p_"),
+            found["beam_covariance"].transpose("beam", "p", "p_").values,
+        )
     variables["beam_origin"] = (("channel", "direction"), origin, {"units": "m"})
     variables["beam_direction"] = (("channel", "direction"), direction, {"units": "1"})
     events = [e.model_dump(mode="json", exclude_none=True) for e in settings.schedule]

@@ -49,7 +49,9 @@ class LiveDrift:
         return self.text()
 
     def _evaluate(self, mean: Array, chunk: xr.Dataset) -> None:
-        origin, direction = chunk["beam_origin"].values, chunk["beam_direction"].values
+        origin, direction = (
+            chunk[name].transpose("channel", "direction").values for name in ("beam_origin", "beam_direction")
+        )
         levels, radius = chunk["level"].values, float(chunk["bar_radius"])
 
         def state(columns: Array) -> State:

@@ -272,8 +272,10 @@ def beams_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Arr
             "beams = 'nominal' needs nominal_origin and nominal_direction(channel, direction), which the raw dataset "
             "does not have. Use beams = 'raw'."
         )
-    origin = np.asarray(raw["nominal_origin" if nominal else "beam_origin"].values, np.float64)
-    direction = np.asarray(raw["nominal_direction" if nominal else "beam_direction"].values, np.float64)
+    of_channel = raw[[f"{'nominal' if nominal else 'beam'}_{part}" for part in ("origin", "direction")]]
+    origin, direction = (
+        np.asarray(each.transpose("channel", "direction").values, np.float64) for each in of_channel.values()
+    )
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
         lost = [c for c, o, u in zip(CHANNELS, origin, direction, strict=True) if not np.isfinite([*o, *u]).all()]
         raise MethodError(f"The beam of {', '.join(lost)} is unknown (NaN); expected origin and direction of all five.")
