@@ -40,6 +40,8 @@ def evaluate_scatter(state: State) -> None:
             )
     if settings.scale_uncertainty > 0:
         state.scale["tracker scale"] = settings.scale_uncertainty
+    else:
+        state.notes.append("Assumed: no uncertainty of the tracker's lengths (scale_uncertainty = 0).")
     if not network.converged:
         state.notes.append(
             f"The network has not converged after {network.iterations} iterations; its results are approximate."

@@ -104,6 +104,8 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
         *beam_sources(bar.origin, bar.direction, bar.covariance, bar.source, calibrated=settings.beams != "nominal"),
         *([radius_source(settings.bar_radius_uncertainty)] if settings.bar_radius_uncertainty else []),
     ]
+    if not settings.bar_radius_uncertainty:
+        notes.append("Assumed: no uncertainty of the radius of the bar (bar_radius_uncertainty = 0).")
     frame = Frame(bar.origin, bar.direction, bar.levels, point)
     independent, influence = propagate(state, then, frame, sigma, sources, [change for *_, change in effects], single)
     # Errors inside the reference state share its noise: the share 1 - 1/m of each mean remains.
