@@ -27,6 +27,9 @@ CLOCK, JOINS = "clock", "joins"
 ORIGIN = "clock_origin"
 """Attribute of raw data of a virtual machine: its clock at the start of the record, s."""
 
+START = "clock_start"
+"""Attribute of raw data of a virtual machine (JSON): its clock and the state of its axes at the start of the record."""
+
 TOLERANCE = 2.0
 """Largest accepted difference of two clocks, s."""
 DRIFT = 1e-3

@@ -1,6 +1,7 @@
 """The raw store contains the appended data, whichever write was the last."""
 
 import json
+import tracemalloc
 import warnings
 from pathlib import Path
 
@@ -255,6 +256,33 @@ def test_a_commit_costs_what_is_new(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     of_new = new * (5 * 2 + 2 * 8)
     assert np.mean(costs) < 5 * of_new
     assert max(costs) < 10 * of_new
+
+
+def test_the_memory_of_a_commit_does_not_grow_with_the_record(tmp_path: Path) -> None:
+    """Rows of a monitor, stored one by one for more than an hour."""
+
+    def row(k: int) -> xr.Dataset:
+        values = {f"value{n}": ("time", [float(n * k)]) for n in range(6)}
+        return xr.Dataset(
+            {"temperature": (("time", "sensor"), np.full((1, 8), 20.0 + k)), **values}, {"time": ("time", [float(k)])}
+        )
+
+    def peak(store: RawStore) -> int:
+        tracemalloc.start()
+        try:
+            store.append(row(store.count))
+            store.commit()
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    store = RawStore.create(tmp_path / "raw.zarr", row(0), "time", 4096)
+    found = []
+    for length in (30, 1000, 3700):
+        while store.count < length:
+            store.append(row(store.count))
+        found.append(peak(store))
+    assert max(found) < 250_000  # bytes; a block of all variables has 2**18 bytes, and is compressed
 
 
 @pytest.mark.parametrize("damage", ["", "{", None])

@@ -30,7 +30,7 @@ SAMPLES = 1 << 16
 
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    found = fault_examples.write(tmp_path_factory.mktemp("campaigns"))
+    found = fault_examples.write(tmp_path_factory.mktemp("campaigns"), fault_examples.SHORT | fault_examples.SECOND)
     for method, changes in SHORTER.items():
         text = found[method].read_text(encoding="utf-8")
         for old, new in changes:
@@ -41,7 +41,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.slow  # a run of every method, and another in two parts; only inputs of later tests are identified
-@pytest.mark.parametrize("method", fault_examples.SHORT)
+@pytest.mark.parametrize("method", fault_examples.SHORT | fault_examples.SECOND)
 def test_continued_run_has_the_raw_data_of_an_undisturbed_one(
     campaigns: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:

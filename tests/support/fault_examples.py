@@ -61,14 +61,25 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
     ),
 }
 """By method and procedure: the example, its campaign, and what is replaced in it (regular expression, text)."""
+SECOND: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
+    "crossbeam_scan, after its pose": (
+        "virtual_gantry",
+        "campaign.toml",
+        [
+            (r"positions = .*", 'positions = ["-200 mm", "200 mm"]\nline_pitch = "140 um"\ncold_repeats = 0'),
+            (r"warm_up = .*", 'warm_up = ["7 min"]'),
+        ],
+    ),
+}
+"""The same of tests that find the machine as an earlier test has left it."""
 BENCH = [(r"points=800&pitch=25e-6&artefacts=-0.6,-0.2,0.2,0.6", "points=400&pitch=50e-6&artefacts=-0.2,0.2")]
 """The same of all benches: half of the profile points, and of the artefacts."""
 
 
-def write(folder: Path) -> dict[str, Path]:
+def write(folder: Path, chosen: dict[str, tuple[str, str, list[tuple[str, str]]]] = SHORT) -> dict[str, Path]:
     """Write the campaigns, and return the file of each by its method."""
     found = {}
-    for method, (example, campaign, changes) in SHORT.items():
+    for method, (example, campaign, changes) in chosen.items():
         place = folder / method.replace(", ", "_")
         shutil.copytree(EXAMPLES / example, place)
         _change(place / campaign, changes, all_found=True)

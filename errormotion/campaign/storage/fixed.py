@@ -11,13 +11,13 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.clock import ORIGIN
+from errormotion.datasets.clock import ORIGIN, START
 from errormotion.datasets.storage.zarr_folder import open_zarr
 from errormotion.errors import RunError
 
 _REMEDY = "All datasets that a method yields must be equal in what does not grow. What is measured so far is stored."
 
-STARTS = ("time_start", "start", ORIGIN)
+STARTS = ("time_start", "start", ORIGIN, START)
 """Attributes that state the beginning of a dataset; the store has those of the first one."""
 
 PER_CHUNK = ("dropped", "invalid", *STARTS)

@@ -81,7 +81,7 @@ def event_fields(event: Any) -> dict[str, Any]:
     return fields
 
 
-_READING = ("identify", "state")
+_READING = ("identify", "state", "snapshot")
 
 # ---------------------------------------------------------------------- driver
 
@@ -196,6 +196,18 @@ class VirtualController(Driver):
             A stream is running, the machine is in alarm, or cannot follow the schedule.
         """
         self._change("follow", schedule=self._events(schedule), time=float(time))
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return ``time`` (s), ``position`` (m) and ``programs`` (number started) of axes at rest, for `restore`."""
+        return self._facts("snapshot", "time", "position", "programs")
+
+    def restore(self, time: float, position: Sequence[float], programs: int) -> None:
+        """Set clock and axes as they were in another process at a `snapshot`; the heat is not changed.
+
+        The times of motions after a command are random. They follow from the number of programs, so that a test that is
+        continued in another process equals one without interruption.
+        """
+        self._change("restore", time=float(time), position=[float(x) for x in position], programs=int(programs))
 
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""

@@ -67,6 +67,10 @@ class SimulatedController(SimulatedDevice):
                 world.start([Event(**event) for event in arguments["schedule"]])
             case "follow":
                 world.follow([Event(**event) for event in arguments["schedule"]], float(arguments["time"]))
+            case "snapshot":
+                return world.snapshot()
+            case "restore":
+                world.restore(**arguments)
             case "elapse":
                 world.elapse(**arguments)
             case "run_steps":

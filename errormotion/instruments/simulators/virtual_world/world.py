@@ -151,6 +151,18 @@ class VirtualWorld(Motion):
         self.motion, self.path, self.program, self._warm_up = None, Path.resting(position), "", None
         self.port_output, self._program_events = [], []
 
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state of the axes at rest, from which the times of later motions follow: see `restore`."""
+        return {"time": self.time, "position": self.position(), "programs": self._programs}
+
+    def restore(self, time: float, position: Sequence[float], programs: int) -> None:
+        """Set the clock, the axes and the number of started programs as in another process; the heat is not changed."""
+        with self._change:
+            self._refuse_while_streaming("set the clock")
+            self._refuse_in_alarm()
+            self._restart(float(time), tuple(map(float, position)))
+            self._programs = int(programs)
+
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""
         if not seconds >= 0:

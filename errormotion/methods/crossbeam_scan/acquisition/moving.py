@@ -5,13 +5,17 @@ A virtual machine has its own clock. It advances only by `elapse`.
 
 from __future__ import annotations
 
+import json
 import time
 from typing import TYPE_CHECKING, Any, Protocol
 
+from errormotion.datasets import clock
 from errormotion.datasets.clock import steady
 from errormotion.errors import InstrumentError
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from errormotion.methods.crossbeam_scan.acquisition.programs import Program
     from errormotion.plugins import Bench
 
@@ -48,6 +52,12 @@ class Mover(Protocol):
 
         With ``listening`` it returns before the motion starts, so that the profiler can be ready.
         """
+
+    def start_attrs(self) -> dict[str, Any]:
+        """Return the attributes that state the beginning of a record on a virtual machine; none for a real one."""
+
+    def return_to_start(self, done: xr.Dataset) -> None:
+        """Set a virtual machine that was restarted to the beginning of a record."""
 
     def wait_until(self, when: float) -> None:
         """Wait until a time, s."""
@@ -127,6 +137,19 @@ class Controlled:
     def _position(self) -> Any:
         return self._control.state().get("position")
 
+    def start_attrs(self) -> dict[str, Any]:
+        """Return the attributes that state the beginning of a record on a virtual machine; none for a real one."""
+        if not self.virtual:
+            return {}
+        origin = self.now()
+        self.finish()  # the last program of an earlier test
+        return {clock.ORIGIN: origin, clock.START: json.dumps(self._control.snapshot())}
+
+    def return_to_start(self, done: xr.Dataset) -> None:
+        """Set a virtual machine that was restarted to the beginning of a record."""
+        if clock.START in done.attrs:
+            self._control.restore(**json.loads(done.attrs[clock.START]))
+
     def _elapse(self, seconds: float) -> None:
         if self.virtual:
             self._control.elapse(seconds)
@@ -143,6 +166,13 @@ class Operated:
         self._bench = bench
         self._running = ""
         self._deadline = 0.0
+
+    def start_attrs(self) -> dict[str, Any]:
+        """Return nothing."""
+        return {}
+
+    def return_to_start(self, done: xr.Dataset) -> None:
+        """Do nothing."""
 
     def now(self) -> float:
         """Return the time of the monotonic clock, s."""

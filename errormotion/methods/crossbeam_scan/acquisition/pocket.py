@@ -61,8 +61,10 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
     first = 0 if done is None else int(done.sizes["scan"])
     repeats = False
     if move.virtual:
-        repeats = done is not None and clock.restarted(done, move.now())
-        static.attrs[clock.ORIGIN] = move.now()
+        if done is not None and clock.restarted(done, move.now()):
+            repeats = True
+            move.return_to_start(done)
+        static.attrs |= move.start_attrs()
     else:
         prepare_profiler(profiler)
     for number in range(0 if repeats else first, len(settings.pocket_lifts)):

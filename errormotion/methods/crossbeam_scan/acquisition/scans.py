@@ -158,8 +158,7 @@ class _Campaign:
         self.pending = Pending(static)
         if done is None:
             static.attrs["start"] = datetime.now(UTC).isoformat(timespec="milliseconds")
-            if move.virtual:
-                static.attrs[clock.ORIGIN] = self.origin
+            static.attrs |= move.start_attrs()
         else:
             self._resume(done)
 
@@ -171,6 +170,8 @@ class _Campaign:
             if clock.restarted(done, self.origin):
                 log.info("the virtual machine was restarted: %d lines are repeated", done.sizes["line"])
                 self.pending.skip = int(done.sizes["line"])
+                self.move.return_to_start(done)
+                self.origin = float(done.attrs.get(clock.ORIGIN, self.origin))
                 return
             self.origin = float(done.attrs[clock.ORIGIN])
         else:
