@@ -142,6 +142,8 @@ class Controlled:
         if not self.virtual:
             return {}
         origin = self.now()
+        if not hasattr(self._control, "snapshot"):
+            return {clock.ORIGIN: origin}
         self.finish()  # the last program of an earlier test
         return {clock.ORIGIN: origin, clock.START: json.dumps(self._control.snapshot())}
 
