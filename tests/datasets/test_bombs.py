@@ -2,6 +2,7 @@
 
 import json
 import struct
+import time
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -12,6 +13,8 @@ import pytest
 import xarray as xr
 from numcodecs import Blosc, Zstd
 
+from errormotion.datasets.files.containers import check_netcdf
+from errormotion.datasets.files.hdf5 import Stored
 from errormotion.datasets.storage.disk import load, save
 from errormotion.errors import DatasetError
 
@@ -175,3 +178,129 @@ def _codec(name: str, options: dict[str, object]) -> object:
     from zarr.codecs import BloscCodec, Crc32cCodec, ZstdCodec
 
     return {"zstd": ZstdCodec, "crc32c": Crc32cCodec}[name]() if name != "blosc" else BloscCodec(**options)
+
+
+def dimension(file: h5py.File, size: int) -> None:
+    scale = file.create_dataset("p", (size,), ">f4")
+    scale.attrs.create("_Netcdf4Dimid", 0, dtype=np.int32)
+    h5py.h5ds.set_scale(scale.id, b"This is a netCDF dimension but not a netCDF variable")
+
+
+def along(variable: h5py.Dataset) -> None:
+    variable.attrs.create("_Netcdf4Coordinates", [0], dtype=np.int32)
+    h5py.h5ds.attach_scale(variable.id, variable.file["p"].id, 0)
+
+
+def test_chunks_without_values_are_counted(tmp_path: Path) -> None:
+    netcdf, zarr = tmp_path / "chunks.nc", tmp_path / "chunks.zarr"
+    with h5py.File(netcdf, "w") as file:
+        dimension(file, 200_000)
+        along(file.create_dataset("v", (200_000,), "i1", chunks=(1,)))
+    refuse(netcdf, r"expected at most \d+ bytes of values .* it states")
+    save(xr.Dataset({"v": ("p", np.zeros(4, np.int8))}), zarr)
+    place = zarr / "v" / "zarr.json"
+    stated = json.loads(place.read_text())
+    stated["shape"], stated["chunk_grid"]["configuration"]["chunk_shape"] = [200_000], [1]
+    place.write_text(json.dumps(stated))
+    refuse(zarr, r"expected at most \d+ bytes of values .* it states")
+
+
+def test_the_time_for_chunks_and_attributes_is_in_proportion_to_their_number(tmp_path: Path) -> None:
+    def seconds(count: int) -> float:
+        path = tmp_path / f"{count}.nc"
+        with h5py.File(path, "w", libver="latest") as file:
+            dimension(file, count)
+            along(file.create_dataset("v", data=np.zeros(count, np.int8), chunks=(1,), compression=1))
+            for k in range(count):
+                file.attrs[f"a{k}"] = k
+        start = time.process_time()
+        check_netcdf(path)
+        return time.process_time() - start
+
+    seconds(10)
+    assert seconds(8000) < 30 * seconds(1000)  # 8 times; 64 times where each takes as long as there are others
+
+
+def test_texts_with_the_width_of_one_long_text_are_refused(tmp_path: Path) -> None:
+    netcdf, zarr = tmp_path / "wide.nc", tmp_path / "wide.zarr"
+    texts = ["x" * LENGTH, *[""] * 3000]  # 1.2 GB in an array of numpy
+    with h5py.File(netcdf, "w") as file:
+        dimension(file, len(texts))
+        along(file.create_dataset("t", data=np.array(texts, object), dtype=h5py.string_dtype()))
+    refuse(netcdf, r"expected at most \d+ bytes of values .* it states")
+    save(xr.Dataset({"t": ("p", np.array(["a"] * len(texts)))}), zarr)
+    content = b"".join(struct.pack("<I", len(each)) + each.encode() for each in texts)
+    (zarr / "t" / "c" / "0").write_bytes(Zstd().encode(struct.pack("<I", len(texts)) + content))
+    refuse(zarr, "its texts need")
+
+
+def test_values_that_become_larger_when_they_are_scaled_are_counted_so(tmp_path: Path) -> None:
+    path = tmp_path / "scaled.nc"
+    with h5py.File(path, "w") as file:
+        dimension(file, 200)
+        file.create_dataset("v", (150 << 20,), "i1", chunks=(1 << 20,)).attrs["scale_factor"] = 0.5
+        file.create_dataset("r", data=np.random.default_rng(1).random(1 << 17))
+    refuse(path, r"expected at most \d+ bytes of values .* it states")
+
+
+@pytest.mark.parametrize("place", ["variable", "attribute"])
+def test_compounds_of_texts_are_refused(tmp_path: Path, place: str) -> None:
+    path = tmp_path / "compound.nc"
+    kind = np.dtype([(f"f{k}", h5py.string_dtype()) for k in range(50)])
+    with h5py.File(path, "w") as file:
+        if place == "variable":
+            file.create_dataset("c", (10,), kind)
+        else:
+            file.attrs.create("a", np.array([("a",) * 50] * 10, kind), dtype=kind)
+    refuse(path, "expected numbers or texts")
+
+
+def test_forged_heaps_are_not_followed_to_their_end(tmp_path: Path) -> None:
+    """Each of many heaps leads to the same long chain of objects."""
+    path = tmp_path / "heap.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("t", (5000,), h5py.string_dtype(), chunks=(5000,), compression=1)[:] = "ab"
+    heaps, objects = 4000, 60_000
+    forged = bytearray(b"\0" * (-path.stat().st_size % 16))
+    for k in range(heaps):
+        rest = 32 * (heaps - k)
+        forged += b"GCOL\1\0\0\0" + struct.pack("<Q", rest + 16 * objects)
+        forged += struct.pack("<HHIQ", 1, 1, 0, rest - 32)
+    forged += struct.pack("<HHIQ", 1, 1, 0, 0) * objects
+    with path.open("ab") as raw:
+        raw.write(forged)
+    size = path.stat().st_size
+    with h5py.File(path) as file:  # not all 240 million objects are followed; nothing is larger than the file
+        assert Stored(path, size, file)._largest() == size
+    refuse(path, r"expected at most \d+ bytes of values .* it states")
+
+
+def test_netcdf_3_variables_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+    path, count, size = tmp_path / "classic.nc", 500, 1 << 20
+    head = b"CDF\2" + struct.pack(">4i", 0, 10, 1, 1) + b"n\0\0\0" + struct.pack(">3i", size, 0, 0)
+
+    def variables(begin: int) -> bytes:
+        found = struct.pack(">2i", 11, count)
+        for k in range(count):
+            found += struct.pack(">i", 8) + b"v%07d" % k + struct.pack(">6iq", 1, 0, 0, 0, 1, size, begin)
+        return found
+
+    path.write_bytes(head + variables(len(head) + len(variables(0))) + bytes(size))
+    refuse(path, r"expected at most \d+ bytes of values .* it states")
+
+
+@pytest.mark.parametrize("rate", [5e-324, np.inf])
+def test_a_rate_without_finite_times_is_refused(tmp_path: Path, rate: float) -> None:
+    path = tmp_path / "rate.nc"
+    xr.Dataset({"v": ("time", np.zeros(4))}, attrs={"sample_rate": rate}).to_netcdf(path, engine="h5netcdf")
+    refuse(path, "rate.nc: sample_rate, time_start: expected finite times")
+
+
+def test_an_empty_dimension_does_not_hide_the_size_of_another(tmp_path: Path) -> None:
+    path = tmp_path / "empty.zarr"
+    save(xr.Dataset({"v": (("time", "s"), np.zeros((4, 1)))}), path)
+    place = path / "v" / "zarr.json"
+    stated = json.loads(place.read_text())
+    stated["shape"] = [1 << 40, 0]
+    place.write_text(json.dumps(stated))
+    refuse(path, r"expected at most \d+ bytes of values .* it states")

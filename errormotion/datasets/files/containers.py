@@ -11,6 +11,7 @@ import math
 import os
 import stat
 import struct
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
@@ -19,7 +20,7 @@ from typing import Any
 import h5py  # type: ignore[import-untyped]
 import numpy as np
 
-from errormotion.datasets.files.hdf5 import Stored, violations
+from errormotion.datasets.files.hdf5 import Stored, violations, wrong_types
 from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.errors import DatasetError
 
@@ -32,12 +33,18 @@ MUCH = 512 << 20
 PER_BYTE_OF_MUCH = 64
 """Bytes of values for each byte of the file or folder above `MUCH`. Reading needs up to five copies of the values."""
 MAX_VARIABLES = 2000
+PER_CHUNK_OF_HDF5, PER_CHUNK_OF_ZARR = 6 << 10, 1 << 10
+"""Bytes that a reader needs for each chunk, also for one that is not stored."""
 MAX_METADATA = 16 << 20
 """Largest size of a zarr.json, bytes."""
 DEEPEST = 24
 """Largest number of levels of folders in a Zarr folder."""
 CODECS = ("bytes", "transpose", "blosc", "zstd", "crc32c", "vlen-utf8")
 """Accepted codecs of Zarr v3, which decode numbers and texts only."""
+DECODED = 8
+"""Least bytes of one value that is scaled, or may be missing, when it is read."""
+_DECODED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
+"""Attributes of such values."""
 _COMPRESSORS = ("blosc", "zstd")
 _CRC_BYTES = 4
 """What the codec crc32c appends, bytes."""
@@ -74,14 +81,43 @@ def check_netcdf(path: Path) -> None:
                 continue  # groups are not read
             if variable.external or variable.is_virtual:
                 found.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
-            pieces = variable.chunks or ()
-            total += max(math.prod(variable.shape or ()), math.prod(pieces)) * max(1, variable.dtype.itemsize)
+            found += [f"{name!r:.100}: {text}" for text in wrong_types(variable)]
+            pieces, decoded = variable.chunks or (), any(each in variable.attrs for each in _DECODED)
+            item = max(DECODED if decoded else 1, variable.id.get_type().get_size())
+            total += max(_number(variable.shape or ()), math.prod(pieces)) * item
+            if pieces:
+                total += math.prod(_counts(variable.shape, pieces)) * PER_CHUNK_OF_HDF5
             variables[name] = variable
+        found += [f"/: {text}" for text in wrong_types(file)]
         if not found and total <= _most(size):  # what follows reads as much as the file states
             stored = Stored(path, size, file)
             found += [f"{name!r:.100}: {text}" for name, each in variables.items() for text in violations(each)]
             total += stored.texts(variables.values(), _most(size) - total)
     _raise(path, found, total, size)
+
+
+def check_classic(path: Path) -> None:
+    """Refuse a NetCDF-3 file that states more values than it may: its variables may name the same bytes.
+
+    Raises
+    ------
+    DatasetError
+        The file has too many variables or values.
+    OSError, ValueError, TypeError
+        The file is damaged.
+    """
+    from scipy.io import netcdf_file
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of scipy, that arrays refer to the file
+        with netcdf_file(path, "r", mmap=True) as file:
+            count = len(file.variables)
+            total = sum(
+                math.prod(each.data.shape) * max(DECODED, each.data.dtype.itemsize) for each in file.variables.values()
+            )
+    if count > MAX_VARIABLES:
+        raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} variables; found {count}")
+    _raise(path, [], total, path.stat().st_size)
 
 
 def stated_schema(path: Path) -> str:
@@ -139,6 +175,7 @@ def check_zarr(path: Path) -> None:
             found.append(f"{name!r:.100}: {wrong}")
             continue
         total += _stated(metadata)
+        total += math.prod(_counts(metadata["shape"], _chunk_shape(metadata))) * PER_CHUNK_OF_ZARR
         found += [f"{name!r:.100}: {text}" for text in _wrong_chunks(path / name, metadata, size)]
     _raise(path, found, total, size)
 
@@ -146,6 +183,16 @@ def check_zarr(path: Path) -> None:
 def _most(size: int) -> int:
     """Return the bytes of values that a file or folder of some bytes may state."""
     return OWN_BYTES + min(PER_BYTE * size, max(MUCH, PER_BYTE_OF_MUCH * size))
+
+
+def _number(shape: Sequence[int]) -> int:
+    """Return a number of values; an empty dimension counts as one, since the others may have coordinates."""
+    return math.prod(max(1, size) for size in shape)
+
+
+def _counts(shape: Sequence[int], chunk: Sequence[int]) -> list[int]:
+    """Return the number of chunks along each dimension."""
+    return [-(-size // each) for size, each in zip(shape, chunk, strict=True)]
 
 
 def _raise(path: Path, found: list[str], total: int, size: int) -> None:
@@ -229,7 +276,10 @@ def _item(metadata: Mapping[str, Any]) -> int:
 
 def _stated(metadata: Mapping[str, Any]) -> int:
     """Return the bytes of the values of an array, or of one chunk if this is larger."""
-    return int(max(math.prod(metadata["shape"]), math.prod(_chunk_shape(metadata))) * _item(metadata))
+    attributes = metadata.get("attributes")
+    decoded = isinstance(attributes, dict) and any(each in attributes for each in _DECODED)
+    item = max(DECODED if decoded else 1, _item(metadata))
+    return int(max(_number(metadata["shape"]), math.prod(_chunk_shape(metadata))) * item)
 
 
 def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Iterator[str]:
@@ -240,7 +290,7 @@ def _wrong_chunks(folder: Path, metadata: Mapping[str, Any], size: int) -> Itera
         return
     checked = _CRC_BYTES if "crc32c" in names[names.index(packed) :] else 0
     items = math.prod(_chunk_shape(metadata))
-    counts = [-(-size // chunk) for size, chunk in zip(metadata["shape"], _chunk_shape(metadata), strict=True)]
+    counts = _counts(metadata["shape"], _chunk_shape(metadata))
     largest = _most(size) if metadata["data_type"] == _TEXT else items * _item(metadata)
     for file in _chunks(str(folder / "c"), counts):
         with open(file, "rb", buffering=0) as chunk:  # a record has thousands of chunks: a buffer would take as long

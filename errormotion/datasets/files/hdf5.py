@@ -25,6 +25,29 @@ _HEAP = b"GCOL"
 """Begin of a collection of heap objects (HDF5 File Format Specification 3.0, III.E)."""
 _DEFLATE, _SHUFFLE, _CHECKSUM = h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32
 _CHECKSUM_BYTES = 4
+_HEAD = 12
+"""Least bytes of the head of an object of a heap."""
+WIDTH = np.dtype("U1").itemsize
+"""Bytes of a character in memory."""
+_PLAIN = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM, h5py.h5t.STRING)
+"""Classes of numbers, truth values and texts."""
+_OF_DIMENSIONS = {b"DIMENSION_LIST": h5py.h5t.VLEN, b"REFERENCE_LIST": h5py.h5t.COMPOUND}
+"""Attributes that link variables to their dimensions, and the classes of their references."""
+
+
+def wrong_types(owner: h5py.File | h5py.Dataset) -> Iterator[str]:
+    """Yield a violation if a variable or an attribute of an object contains neither numbers nor texts.
+
+    A value of another type may contain any number of others, so that sizes do not follow from the number of values.
+    """
+    if isinstance(owner, h5py.Dataset) and owner.id.get_type().get_class() not in _PLAIN:
+        yield "expected numbers or texts; found a compound, a list of variable length or another type of HDF5"
+    for name, attribute in _attributes(owner):
+        kind = attribute.get_type()
+        linking = kind.get_class() == _OF_DIMENSIONS.get(name) and not kind.detect_class(h5py.h5t.STRING)
+        if not (kind.get_class() in _PLAIN or linking):
+            yield f"attribute {name.decode(errors='replace')!r:.100}: expected numbers or texts; found another type"
+            return
 
 
 def violations(variable: h5py.Dataset) -> Iterator[str]:
@@ -47,19 +70,31 @@ def _oversized(variable: h5py.Dataset, filters: list[int]) -> Iterator[str]:
     most = math.prod(variable.chunks) * variable.id.get_type().get_size() + _CHECKSUM_BYTES * len(filters)
     place = filters.index(_DEFLATE)
 
-    def is_larger(chunk: int) -> bool:
-        mask, packed = variable.id.read_direct_chunk(variable.id.get_chunk_info(chunk).chunk_offset)
+    def is_larger(chunk: tuple[int, ...]) -> bool:
+        mask, packed = variable.id.read_direct_chunk(chunk)
         if mask & 1 << place:  # this chunk is plain
             return bool(len(packed) > most)
         return bool(len(zlib.decompressobj().decompress(packed, most + 1)) > most)
 
-    count = variable.id.get_num_chunks()
-    with ThreadPoolExecutor(min(cores(), max(count, 1)), thread_name_prefix="chunk") as pool:
+    def one_is_larger(chunks: list[tuple[int, ...]]) -> bool:
+        return any(map(is_larger, chunks))
+
+    chunks = _chunks(variable)
+    threads = min(cores(), max(len(chunks), 1))
+    with ThreadPoolExecutor(threads, thread_name_prefix="chunk") as pool:
         try:
-            if any(pool.map(is_larger, range(count))):
+            if any(pool.map(one_is_larger, [chunks[k::threads] for k in range(threads)])):
                 yield f"expected chunks of at most {most} bytes; found one that contains more"
         except zlib.error as error:
             yield f"a compressed chunk is damaged ({error}): copy the file again"
+
+
+def _chunks(variable: h5py.Dataset) -> list[tuple[int, ...]]:
+    """Return the places of all chunks in one pass; HDF5 looks up a chunk by its number in a time that grows with it."""
+    places: list[tuple[int, ...]] = []
+    if variable.id.get_num_chunks():
+        variable.id.chunk_iter(lambda each: places.append(each.chunk_offset))
+    return places
 
 
 @dataclass(frozen=True)
@@ -87,26 +122,26 @@ class Stored:
         exact, references = 0, _in_attributes(self.file)
         for variable in variables:
             references += _in_attributes(variable)
-            if _refers(variable.id.get_type()):
+            if is_text(variable):
                 found = self._lengths(variable)
                 exact += found or 0
                 references += math.prod(variable.shape or ()) if found is None else 0
-        if exact + references * self.size <= most:
-            return exact + references * self.size
-        return exact + references * self._largest()
+        if exact + WIDTH * references * self.size <= most:
+            return exact + WIDTH * references * self.size
+        return exact + WIDTH * references * self._largest()
 
     def _lengths(self, variable: h5py.Dataset) -> int | None:
-        """Return the bytes that the references of a variable state; None where they are compressed or in its header."""
+        """Return the bytes of the texts of a variable in memory, where each has the width of the longest one.
+
+        None where the references are compressed or in its header.
+        """
         addresses, _ = self.file.id.get_create_plist().get_sizes()
         properties = variable.id.get_create_plist()
         if properties.get_nfilters() or properties.get_layout() == h5py.h5d.COMPACT:
             return None
         reference = np.dtype([("length", "<u4"), ("address", f"V{addresses}"), ("index", "<u4")])
-        unit = variable.id.get_type()
-        width = unit.get_super().get_size() if unit.get_class() == h5py.h5t.VLEN else 1
         if variable.chunks:
-            places = (variable.id.get_chunk_info(k) for k in range(variable.id.get_num_chunks()))
-            pieces = [variable.id.read_direct_chunk(each.chunk_offset)[1] for each in places]
+            pieces = [variable.id.read_direct_chunk(each)[1] for each in _chunks(variable)]
         elif variable.id.get_offset() is None:
             return 0  # nothing was written
         else:
@@ -116,46 +151,56 @@ class Stored:
         stated = [
             np.frombuffer(each[: len(each) // reference.itemsize * reference.itemsize], reference) for each in pieces
         ]
-        return sum(int(each["length"].sum(dtype=np.uint64)) for each in stated) * width
+        longest = max((int(each["length"].max(initial=0)) for each in stated), default=0)
+        return WIDTH * math.prod(variable.shape or ()) * longest
 
     def _largest(self) -> int:
-        """Return the size of the largest object of the heaps, bytes; every heap has a signature."""
+        """Return the size of the largest object of the heaps, bytes; every heap has a signature.
+
+        Heaps do not overlap, and an object has a head. Where more objects are found, the heaps are forged,
+        and the limit is the size of the file.
+        """
         _, lengths = self.file.id.get_create_plist().get_sizes()
-        largest = 0
+        largest, left = 0, self.size // _HEAD + 1
         with self.path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             at = content.find(_HEAP)
             while at >= 0:
-                largest = max(largest, _largest_object(content, at, lengths))
+                size, count = _largest_object(content, at, lengths)
+                largest, left = max(largest, size), left - count
+                if left < 0:
+                    return self.size
                 at = content.find(_HEAP, at + len(_HEAP))
         return largest
 
 
-def _largest_object(content: mmap.mmap, at: int, lengths: int) -> int:
-    """Return the size of the largest object of a collection that begins at a place of a file."""
+def _largest_object(content: mmap.mmap, at: int, lengths: int) -> tuple[int, int]:
+    """Return the size of the largest object of a collection that begins at a place of a file, and their number."""
     end = min(len(content), at + int.from_bytes(content[at + 8 : at + 8 + lengths], "little"))
-    place, largest = at + 8 + lengths, 0
+    place, largest, count = at + 8 + lengths, 0, 0
     while place + 8 + lengths <= end:
         index = int.from_bytes(content[place : place + 2], "little")
         size = int.from_bytes(content[place + 8 : place + 8 + lengths], "little")
         if index == 0 or place + 8 + lengths + size > end:  # the free space is the last object
             break
-        largest = max(largest, size)
+        largest, count = max(largest, size), count + 1
         place += 8 + lengths + -(-size // 8) * 8
-    return largest
+    return largest, count
 
 
-def _refers(kind: Any) -> bool:
-    """Return whether values of a type of HDF5 are references to a heap, or contain such."""
-    if kind.get_class() == h5py.h5t.STRING:
-        return bool(kind.is_variable_str())
-    return kind.get_class() in (h5py.h5t.VLEN, h5py.h5t.COMPOUND, h5py.h5t.ARRAY)
+def is_text(owner: Any) -> bool:
+    """Return whether the values of a variable or an attribute are references to texts in a heap."""
+    kind = (owner.id if isinstance(owner, h5py.Dataset) else owner).get_type()
+    return bool(kind.get_class() == h5py.h5t.STRING and kind.is_variable_str())
 
 
 def _in_attributes(owner: h5py.File | h5py.Dataset) -> int:
     """Return the number of references to a heap in the attributes of an object."""
-    found = 0
-    for k in range(h5py.h5a.get_num_attrs(owner.id)):
-        attribute = h5py.h5a.open(owner.id, index=k)
-        if _refers(attribute.get_type()):
-            found += math.prod(attribute.shape)
-    return found
+    return sum(math.prod(each.shape) for name, each in _attributes(owner) if name in _OF_DIMENSIONS or is_text(each))
+
+
+def _attributes(owner: h5py.File | h5py.Dataset) -> Iterator[tuple[bytes, Any]]:
+    """Yield name and attribute, by name: HDF5 sorts all attributes again for each one that is opened by its number."""
+    names: list[bytes] = []
+    h5py.h5a.iterate(owner.id, names.append)
+    for name in names:
+        yield name, h5py.h5a.open(owner.id, name)

@@ -15,7 +15,8 @@ import xarray as xr
 from xarray.indexes import RangeIndex
 
 from errormotion.datasets.checks import storable_violations
-from errormotion.datasets.files.containers import check_netcdf, check_zarr
+from errormotion.datasets.files.containers import MUCH, check_classic, check_netcdf, check_zarr
+from errormotion.datasets.files.hdf5 import WIDTH
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import reason, replace_bytes, whole_folder, writing
 from errormotion.datasets.schemas import SCHEMA
@@ -70,12 +71,13 @@ def load(path: str | Path) -> xr.Dataset:
             known = open_zarr(path)
             ds = _opened(path, engine, consolidated=_is_consolidated(path)) if known is None else known
         else:
+            check_classic(path)
             ds = _opened(path, engine)
         ds = _tidy(ds)
         if ds.attrs.get("schema") == SCHEMA:
             with ds:
                 ds = ds.load()
-    return _with_indexes(ds)
+        return _with_indexes(ds)
 
 
 def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -191,7 +193,9 @@ def _is_consolidated(folder: Path) -> bool:
 def _reading(path: Path) -> Iterator[None]:
     try:
         yield
-    except DatasetError:
+    except DatasetError as error:
+        if not str(error).startswith(str(path)):
+            error.args = (f"{path}: {error}",)
         raise
     except PermissionError as error:
         raise DatasetError(f"{path}: cannot be read: permission denied") from error
@@ -249,6 +253,9 @@ def _tidy(ds: xr.Dataset) -> xr.Dataset:
 
 def _text(variable: xr.Variable) -> xr.Variable:
     values = [item.decode() if isinstance(item, bytes) else str(item) for item in variable.values.ravel().tolist()]
+    needed = WIDTH * len(values) * max(map(len, values), default=0)  # every text has the width of the longest one
+    if needed > MUCH:
+        raise DatasetError(f"its texts need {needed} bytes, since all have the width of the longest; at most {MUCH}")
     array = np.array(values, dtype=str).reshape(variable.shape)
     return xr.Variable(variable.dims, array, variable.attrs)
 
@@ -274,6 +281,8 @@ def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
     rate = ds.attrs.get("sample_rate")
     if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:
         start, size = float(ds.attrs.get("time_start", 0.0)), ds.sizes["time"]
+        if not math.isfinite(start + size / rate) or not 1 / rate > 0:
+            raise DatasetError(f"sample_rate, time_start: expected finite times; found {rate:g} Hz, {start:g} s")
         # Half a step before the end, so that the number of times does not depend on rounding; the step is 1 / rate.
         index = RangeIndex.arange(start, start + (size - 0.5) / rate, 1 / rate, dim="time")
         ds = ds.assign_coords(xr.Coordinates.from_xindex(index))
