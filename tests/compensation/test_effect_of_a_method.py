@@ -25,7 +25,7 @@ def test_figures_of_iso_230_2_are_compared() -> None:
         assert pairs[first.name].before == (first.value, first.expanded_uncertainty)
         assert pairs[first.name].after == (second.value, second.expanded_uncertainty)
     for name in ("A", "E", "M"):
-        (pair,) = [pair for key, pair in pairs.items() if key.split()[0] == name]
+        (pair,) = [pair for key, pair in pairs.items() if key.split()[0] == name and "corrected" not in key]
         assert pair.reduction.value == pytest.approx(0.8, abs=0.02)
         assert pair.reduction.low < pair.reduction.value < pair.reduction.high
 

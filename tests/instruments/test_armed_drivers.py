@@ -22,7 +22,7 @@ DRIVERS = [
     for each in plugins.available("instruments")
     if each.distribution.startswith("errormotion ") and changes_machine(plugins.get("instruments", each.id))
 ]
-READING = {"open", "close", "identify", "configure", "bound", "read", "state", "conformance", "pretravel"}
+READING = {"open", "close", "identify", "configure", "bound", "read", "state", "snapshot", "conformance", "pretravel"}
 """Methods of which none sends an order."""
 ALWAYS = {"stop", "estop", "press_estop", "elapse", "finish", "resynchronise", "exchange"}
 """Methods that are allowed without arm: what stops a machine, waits, or has no effect by itself."""
@@ -40,6 +40,7 @@ ARGUMENTS: dict[str, Any] = {
     "step": 1e-3,
     "count": 3,
     "kind": "plane",
+    "programs": 1,
     "touches": [Touch((0.0, 0.0, 0.1), (0.0, 0.0, 0.09))],
 }
 

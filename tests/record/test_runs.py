@@ -185,7 +185,7 @@ def test_a_folder_that_cannot_be_written_is_listed(tmp_path: Path, monkeypatch: 
     def refuse(*_: Any, **__: Any) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(index, "replace_text", refuse)
     assert len(listing.list_runs([tmp_path]).runs) == 1
     assert not (tmp_path / index.FILE).exists()
 

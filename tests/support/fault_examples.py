@@ -43,7 +43,7 @@ SHORT: dict[str, tuple[str, str, list[tuple[str, str]]]] = {
     "linear_positioning": (
         "virtual_positioning",
         "campaign.toml",
-        [(r"feed = ", "runs = 3\ncount = 4\nfeed = ")],
+        [(r"feed = ", "runs = 4\ncount = 4\nfeed = ")],
     ),
     "linear_positioning, diagonals": (
         "virtual_diagonals",

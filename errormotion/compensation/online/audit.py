@@ -46,8 +46,6 @@ _LINE = re.compile(
     re.DOTALL,
 )
 
-_FLUSH = getattr(os, "fdatasync", os.fsync)
-
 log = logging.getLogger(__name__)
 
 
@@ -165,7 +163,7 @@ class AuditLog:
 
     def _sync(self) -> None:
         """Wait until the entries are on the disk, then store their number: it never exceeds that of the file."""
-        _FLUSH(self._file)
+        getattr(os, "fdatasync", os.fsync)(self._file)
         self._synced = time.monotonic()
         if self._saved == self._count:
             return

@@ -19,7 +19,7 @@ PICTURES = {
     ".svg": (b"", "image/svg+xml"),
 }
 """First bytes of a file by suffix, and its media type."""
-_SVG = re.compile(rb"(\xef\xbb\xbf)?(\s|<\?xml[^>]*\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)*<(\w+:)?svg[\s>]", re.DOTALL)
+_SVG = re.compile(rb"(\xef\xbb\xbf)?(\s|<\?xml[^>]*\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)*<(\w+:)?svg[\s/>]", re.DOTALL)
 """Begin of a picture of SVG: its first element, behind a declaration and comments."""
 
 
