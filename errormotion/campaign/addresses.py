@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Mapping
 from contextlib import suppress
 from ipaddress import ip_address
@@ -10,7 +11,7 @@ from typing import Any
 
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan
 from errormotion.errors import ErrormotionError, InstrumentError
-from errormotion.instruments.transports.address import CAN, HTTP, MODBUS, OPC, Address, parse_address
+from errormotion.instruments.transports.address import CAN, HTTP, MODBUS, OPC, Address, number_of_host, parse_address
 
 EXEMPT = ("sim", "replay")
 """Schemes of devices that exist in one process only, and of recordings."""
@@ -53,9 +54,9 @@ def is_line(url: str) -> bool:
 def same_device(url: str) -> str:
     """Return a text that is equal for all addresses of one device; empty without an address.
 
-    The same are upper and lower case of a host, a stated default port, the names and numbers of this computer, the
-    links to a serial line or a file, and parameters that do not select a device. Different names of another computer
-    are not compared.
+    The same are upper and lower case of a host, all spellings of its number, a stated default port, the names and
+    numbers of this computer, the links to a serial line or a file, and parameters that do not select a device.
+    Different names of another computer are not compared.
     """
     try:
         address = parse_address(url)
@@ -85,8 +86,8 @@ def _selected(address: Address, name: str, default: str) -> str:
 
 
 def _host(name: str) -> str:
-    name = name.lower().rstrip(".")
-    if name in _THIS_COMPUTER:
+    name = number_of_host(name.lower().rstrip("."))
+    if name in _THIS_COMPUTER or name == platform.node().lower():
         return LOOPBACK
     try:
         number = ip_address(name)

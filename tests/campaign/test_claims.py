@@ -1,6 +1,7 @@
 """One device serves one program: a second one is refused and told who uses it; a display closes its instruments."""
 
 import os
+import platform
 import signal
 import stat
 import subprocess
@@ -87,6 +88,12 @@ def command(folder: Path, *arguments: str, state: str) -> "subprocess.Popen[str]
         ("tcp://[::1]:7", "tcp://LOCALHOST:7"),
         ("tcp://[0:0:0:0:0:0:0:1]:7", "tcp://127.0.0.1:7"),
         ("tcp://[::ffff:192.0.2.1]:7", "tcp://192.0.2.1:7"),
+        ("modbus+tcp://10.1", "tcp://10.0.0.1:502"),
+        ("tcp://0xC0.0.2.1:7", "tcp://192.0.2.1.:7"),
+        ("tcp://3221225985:7", "tcp://192.0.2.1:7"),
+        ("tcp://192.0.02.01:7", "tcp://192.0.2.1:7"),
+        ("tcp://127.1:7", "tcp://localhost:7"),
+        (f"tcp://{platform.node().upper()}:7", "tcp://localhost:7"),
         ("tcp://[2001:DB8:0::1]:7", "tcp://[2001:db8::1]:7"),
         ("serial:///dev/ttyX?baudrate=9600", "modbus+rtu:///dev/ttyX?unit=3"),
         ("can://socketcan/can0?node=5&bitrate=1", "can://socketcan/can0?bitrate=1&node=5"),

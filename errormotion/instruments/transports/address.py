@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from socket import inet_aton, inet_ntoa
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from errormotion.errors import InstrumentError
@@ -91,6 +92,14 @@ class Address:
         """Return the URL with another path and the same parameters."""
         query = f"?{urlencode(self.params)}" if self.params else ""
         return f"{self.scheme}://{self.host}/{path}{query}"
+
+
+def number_of_host(name: str) -> str:
+    """Return the IPv4 address that a host states in any of its spellings, such as 10.1 for 10.0.0.1; else the name."""
+    try:
+        return inet_ntoa(inet_aton(name)) if name and " " not in name else name
+    except OSError:
+        return name
 
 
 def parse_address(url: str) -> Address:
