@@ -28,9 +28,8 @@ from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, parse_bench, parse_campaign
 from errormotion.campaign.folder import FolderGoneError, RunFolder, Status, list_runs, new_entries, now
 from errormotion.campaign.planning.ready import accept_overdue, cannot_continue, require_ready
-from errormotion.campaign.planning.release import Release, announced, refuse, to_release
+from errormotion.campaign.planning.release import Release, announced, forbidden, refuse, to_release
 from errormotion.campaign.sections import head
-from errormotion.campaign.sections.limits import NO_MOTIONS
 from errormotion.campaign.sections.timeline import follower
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.campaign.storage.recorder import DiskFullError, Recorder
@@ -386,7 +385,7 @@ class _Session:
         if test.certificates:
             attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
         own = self._set_clock(folder, test)
-        bench.set_limits("" if hasattr(method, "motions") else NO_MOTIONS.format(method.info.id))
+        bench.set_limits(forbidden(self.campaign, test))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
         follow = getattr(method, "follow", None) if self.progress.shown else None

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import stat
 import subprocess
@@ -22,6 +23,7 @@ from errormotion.campaign.background.preliminary import preliminary, samples
 from errormotion.campaign.background.publishing import Published
 from errormotion.campaign.files import CampaignPlan
 from errormotion.campaign.folder import RunFolder, list_runs
+from errormotion.campaign.planning.release import released
 from errormotion.cli.app import app
 from errormotion.errors import MethodError, RunError
 
@@ -100,6 +102,27 @@ def test_the_end_states_the_message_of_the_process_or_its_absence(tmp_path: Path
     for order in (lambda: processes.stop(tmp_path, NAME), lambda: processes.answer(tmp_path, NAME, 1)):
         with pytest.raises(RunError):
             order()
+
+
+def test_pipes_and_links_in_a_foreign_folder_neither_block_nor_are_written_through(
+    plan: Callable[..., CampaignPlan], tmp_path: Path
+) -> None:
+    folder, target = tmp_path / ".background" / NAME, tmp_path / "target"
+    folder.mkdir(parents=True)
+    (folder / "process.json").write_text('{"campaign": "c", "machine": "m"}')
+    os.mkfifo(folder / "lock")
+    os.mkfifo(folder / "output.txt")
+    (found,) = processes.found(tmp_path)
+    assert (found.alive, found.ended, found.message) == (False, "killed", "")
+    shutil.rmtree(tmp_path / ".background")
+    (tmp_path / ".background").symlink_to(target)
+    with pytest.raises(RunError):
+        processes._start(tmp_path, plan('name = "a"'), [], [], released)
+    assert not target.exists()
+    target.mkdir()
+    with pytest.raises(RunError, match="found a link"):
+        processes._start(tmp_path, plan('name = "a"'), [], [], released)
+    assert list(target.iterdir()) == []
 
 
 @contextmanager

@@ -4,7 +4,8 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,34 @@ def test_a_background_process_is_released_where_it_is_started(
     finally:
         if found.alive:
             processes.stop(campaign.parent / "runs", found.name)
+
+
+@pytest.mark.parametrize("change", ["the path", "the address", "nothing"])
+def test_a_background_process_moves_only_as_released(campaign: Path, change: str) -> None:
+    """The files are changed after the release, before the process has read them."""
+    folder, runs = campaign.parent, campaign.parent / "runs"
+
+    def release(motions: Sequence[str]) -> None:
+        assert len(motions) == 1
+        if change == "the path":
+            campaign.write_text(campaign.read_text().replace('"40 mm"', '"45 mm"'))
+        elif change == "the address":
+            bench = folder / "bench.toml"
+            bench.write_text(bench.read_text().replace('machine = "Mill 7"', 'machine = "Mill 8"'))
+
+    name = processes.start(campaign, runs, release)
+    deadline = time.monotonic() + 100
+    while (found := processes.found(runs)[0]).alive and found.stage != runner.MEASURING and time.monotonic() < deadline:
+        time.sleep(0.2)
+    if change == "nothing":
+        assert (found.name, found.alive, found.stage) == (name, True, runner.MEASURING), found.message
+        processes.stop(runs, name)
+        while processes.found(runs)[0].alive and time.monotonic() < deadline:
+            time.sleep(0.2)
+    else:
+        assert found.ended == "failed"
+        assert "not those that were released" in " ".join(found.message.split())
+        assert list_runs(runs) == []
 
 
 class Stopping(runner.Quiet):

@@ -219,9 +219,12 @@ def test_a_real_machine_is_started_only_with_the_word_that_releases_its_motions(
     for odd in (True, 1, ["move"]):
         assert _post(controlling, "/measure/start", **order, release=odd)[0] == 400
     assert started == []
-    status, found = _post(controlling, "/measure/start", **order, release="move")
+    for shown in ({}, {"motions": []}, {"motions": [line.replace("15000", "1500")]}):  # the word alone, or for others
+        status, found = _post(controlling, "/measure/start", **order, **shown, release="move")
+        assert (status, found["process"], found["motions"], started) == (200, "", [line], [])
+    status, found = _post(controlling, "/measure/start", **order, release="move", motions=[line])
     assert (status, bool(found["process"])) == (200, True)
-    assert [each[-1] for each in started] == ["--move"]
+    assert ["--move" in each for each in started] == [False]
 
 
 def test_a_simulated_machine_is_started_at_once(

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from errormotion.datasets.files.reading import require_regular
+
 MAX_OUTPUT = 4000
 """Size of the end of the output that is shown, bytes."""
 
@@ -44,7 +46,9 @@ def spawn(arguments: Sequence[str], output: Path, *, inherited: Sequence[int] = 
 
 def printed(output: Path) -> str:
     """Return the end of the output of a process; empty if it cannot be read."""
-    with suppress(OSError), output.open("rb") as file:
-        file.seek(max(0, file.seek(0, 2) - MAX_OUTPUT))
-        return file.read(MAX_OUTPUT).decode("utf-8", "replace").strip()
+    with suppress(OSError):
+        require_regular(output)
+        with output.open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - MAX_OUTPUT))
+            return file.read(MAX_OUTPUT).decode("utf-8", "replace").strip()
     return ""

@@ -24,15 +24,15 @@ from uuid import uuid4
 
 from errormotion.campaign.background import signals
 from errormotion.campaign.background.detached import printed, spawn
-from errormotion.campaign.background.publishing import ANSWER, STATUS
+from errormotion.campaign.background.publishing import ANSWER, STATUS, store_released
 from errormotion.campaign.claims import require_free, uses
 from errormotion.campaign.files import CampaignPlan, TestPlan, load_campaign
 from errormotion.campaign.folder import RunFolder, is_locked, now
 from errormotion.campaign.planning.ready import require_ready
-from errormotion.campaign.planning.release import OPTION, Release, refuse, to_release
+from errormotion.campaign.planning.release import Release, refuse, to_release
 from errormotion.campaign.runner import folders_of, stored_plan, to_measure
 from errormotion.datasets.files.reading import read_bytes
-from errormotion.datasets.files.writing import replace_text
+from errormotion.datasets.files.writing import open_to_append, replace_text
 from errormotion.errors import RunError
 
 try:
@@ -202,7 +202,7 @@ def stop(runs: Path, name: str) -> None:
         ) from None
     except OSError as error:
         raise RunError(f"{process.campaign}: cannot be stopped: {error.strerror}") from error
-    requested.touch()
+    replace_text(requested, "")
 
 
 def _start(
@@ -216,27 +216,30 @@ def _start(
         require_free(uses(plan.bench))
     if motions := to_release(plan, tests):
         release(motions)
-        arguments = [*arguments, OPTION]
     try:
         runs.mkdir(parents=True, exist_ok=True)
         root = runs / FOLDER
         root.mkdir(mode=0o700, exist_ok=True)
+        if root.is_symlink():
+            raise RunError(f"{root}: expected a folder; found a link, and links are not written through. Remove it")
         with _exclusive(root):
             for each in found(runs):
                 if each.alive and each.machine == machine:
                     raise RunError(f"'{each.campaign}' has used {machine} since {each.started}; stop it first")
             _tidy(root)
             name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
-            _spawn(root / name, runs, {"campaign": plan.name, "machine": machine, "started": now()}, arguments)
+            folder = root / name
+            folder.mkdir(mode=0o700)
+            store_released(folder, motions, "" if "--resume" in arguments else plan.sha256)
+            _spawn(folder, runs, {"campaign": plan.name, "machine": machine, "started": now()}, arguments)
     except OSError as error:
         raise RunError(f"{runs}: the process cannot be started: {error.strerror}") from error
     return name
 
 
 def _spawn(folder: Path, runs: Path, state: dict[str, Any], arguments: Sequence[str]) -> None:
-    folder.mkdir(mode=0o700)
     command = [*COMMAND[2:], *_publishing(folder), *arguments, "--runs", str(runs.resolve())]
-    lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    lock = open_to_append(folder / "lock", 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         child = spawn(command, folder / OUTPUT, inherited=[lock])
@@ -255,7 +258,7 @@ def _publishing(folder: Path) -> list[str]:
 @contextmanager
 def _exclusive(root: Path) -> Iterator[None]:
     """Serialize starts, so that two processes never start on the same machine."""
-    lock = os.open(root / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    lock = open_to_append(root / "lock", 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

@@ -9,14 +9,16 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import parse_json, read_bytes
 from errormotion.datasets.files.writing import replace_text
+from errormotion.errors import RunError
 
-STATUS, ANSWER = "status.json", "answer"
+STATUS, ANSWER, RELEASED = "status.json", "answer", "released.json"
 INTERVAL = 0.5
 """Shortest interval between two updates of the progress, s."""
 POLL_INTERVAL = 0.2
@@ -27,6 +29,33 @@ MAX_TESTS = 1000
 """Number of tests that are listed in the state."""
 MAX_ANSWER = 100
 """Largest size of an answer, bytes."""
+MAX_RELEASED = 1 << 22
+"""Largest size of the released motions, bytes."""
+
+
+def store_released(folder: Path, motions: Sequence[str], sha256: str) -> None:
+    """State the motions that a person has released, and the hash of the files from which they follow."""
+    replace_text(folder / RELEASED, json.dumps({"motions": list(motions), "sha256": sha256}))
+
+
+def released_in(folder: Path, sha256: str) -> Callable[[Sequence[str]], None]:
+    """Return the release of a process: of the motions that a person was shown and has released, and of no others.
+
+    The process reads the campaign again when it begins; a file may have changed since.
+    """
+
+    def release(motions: Sequence[str]) -> None:
+        try:
+            stated = parse_json(read_bytes(folder / RELEASED, MAX_RELEASED))
+        except (OSError, ValueError):
+            stated = None
+        if stated != {"motions": list(motions), "sha256": sha256}:
+            raise RunError(
+                "Nothing has moved, and nothing was created: the motions are not those that were released, since the "
+                "campaign or its bench file has changed meanwhile. Check the motions, and start it again."
+            )
+
+    return release
 
 
 class Published:

@@ -7,6 +7,7 @@ access to the folder only.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from errormotion.campaign.folder import is_locked
 from errormotion.compensation.online.settings import Limits
 from errormotion.datasets.files.reading import read_bytes
-from errormotion.datasets.files.writing import replace_text
+from errormotion.datasets.files.writing import open_to_append, replace_text
 from errormotion.errors import CompensationError
 
 AUDIT = "audit.jsonl"
@@ -172,7 +173,7 @@ def request_stop(folder: Path) -> None:
     if not is_working(folder):
         raise CompensationError(f"{folder}: no compensation is running in this folder; there is nothing to stop.")
     try:
-        (folder / STOP).touch()
+        os.close(open_to_append(folder / STOP))
     except OSError as error:
         raise CompensationError(
             f"{folder / STOP}: cannot be written: {error.strerror}. Stop the command by Ctrl-C in its terminal."

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 from errormotion.campaign.addresses import is_simulated
 from errormotion.campaign.files import CampaignPlan, TestPlan
-from errormotion.campaign.sections.limits import announcement, moves, steps_of
+from errormotion.campaign.sections.limits import NO_MOTIONS, announcement, moves, steps_of
 from errormotion.errors import RunError
 from errormotion.plugins import Step
 
@@ -68,6 +68,14 @@ def require_word(found: str) -> None:
             f"Nothing has moved, and nothing was created: expected the word '{WORD}', which releases the motions; "
             f"found '{found.strip()[:40]}'."
         )
+
+
+def forbidden(plan: CampaignPlan, test: TestPlan) -> str:
+    """Return why a test must not command a motion: it states none, so that nobody was asked; else an empty text."""
+    steps, name = _steps(plan, test), test.method.info.id
+    if steps is None:
+        return NO_MOTIONS.format(name)
+    return "" if moves(steps) else f"the method '{name}' states that nothing moves in this test"
 
 
 def _steps(plan: CampaignPlan, test: TestPlan) -> list[Step] | None:

@@ -58,15 +58,16 @@ class _OfCampaigns(Guarded):
     async def released(self, start: Callable[..., str], *values: Any) -> dict[str, Any]:
         """Start a process, and return its name as ``process``; empty until the person has released its motions.
 
-        The text ``release`` of the request is what the person typed. Without it, nothing is started; the answer has the
-        ``motions`` and the ``word`` that releases them.
+        The text ``release`` of the request is what the person typed, and ``motions`` what the page showed. Without
+        them, or if the motions are others now, nothing is started; the answer has the ``motions`` and the ``word`` that
+        releases them.
         """
-        typed = self.found.get("release", "")
+        typed, shown = self.found.get("release", ""), self.found.get("motions")
         if not isinstance(typed, str):
             raise HTTPError(400, reason="release: expected a text")
 
         def release(motions: Sequence[str]) -> None:
-            if not typed:
+            if not typed or (shown != list(motions) and typed.strip() == WORD):
                 raise _UnreleasedError(tuple(motions))
             require_word(typed)
 

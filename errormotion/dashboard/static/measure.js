@@ -206,13 +206,13 @@ function endRelease() {
   byId("release-card").hidden = true;
 }
 
-async function started(path, body, typed = "") { // start or resume; returns the answer once a process was started
-  const found = await ask(path, { ...body, release: typed });
+async function started(path, body, typed = "", motions = []) { // start or resume; returns the answer once a process was started
+  const found = await ask(path, { ...body, release: typed, motions });
   if (found.process) {
     endRelease();
     return found;
   }
-  askRelease(found, (word) => started(path, body, word));
+  askRelease(found, (word) => started(path, body, word, found.motions));
   return null;
 }
 

@@ -11,10 +11,10 @@ import typer
 from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.background import processes
-from errormotion.campaign.background.publishing import Published
+from errormotion.campaign.background.publishing import Published, released_in
 from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
-from errormotion.campaign.planning.release import refuse, released
+from errormotion.campaign.planning.release import Release, refuse, released
 from errormotion.cli.commands.campaigns import background as command
 from errormotion.cli.guard import USAGE
 from errormotion.cli.output import show, show_json
@@ -93,7 +93,9 @@ def work(
     """
     with Bars(quiet, announcing=announcing) if publish is None else Published(publish) as bars:
         ask = _assume_done if yes else bars.ask if publish is not None or on_terminal() else None
-        release = released if move else bars.release if isinstance(bars, Bars) and on_terminal() else refuse
+        release: Release = released if move else bars.release if isinstance(bars, Bars) and on_terminal() else refuse
+        if publish is not None and not move:
+            release = released_in(publish, "" if plan is None else plan.sha256)
         report = report_of_run if with_report else None
         if resume or plan is None:
             return runner.resume(plan, run_id=run_id, runs=runs, progress=bars, ask=ask, report=report, release=release)
