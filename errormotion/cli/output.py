@@ -24,8 +24,9 @@ NOTICE_DELAY = 1.0
 """Duration after which a line states what the command is doing, s."""
 
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""Characters that a terminal executes: controls other than tab and line feed, and changes of direction."""
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that a terminal executes: controls other than tab and line feed, and changes of direction; and bytes of a
+file name that are no text, which cannot be printed."""
 
 
 def printable(text: str) -> str:

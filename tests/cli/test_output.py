@@ -65,8 +65,8 @@ def test_long_operations_are_announced_on_a_terminal_only(monkeypatch: pytest.Mo
     assert work(0.0) == ""
 
 
-CONTROLS = "\x1b]0;title\x07 \x9b31m \x7f \u202e \r"
-ESCAPES = r"\x1b]0;title\x07 \x9b31m \x7f \u202e \x0d"
+CONTROLS = "\x1b]0;title\x07 \x9b31m \x7f \u202e \udcff \r"
+ESCAPES = r"\x1b]0;title\x07 \x9b31m \x7f \u202e \udcff \x0d"
 
 
 def test_control_characters_are_printed_as_escapes(capsys) -> None:

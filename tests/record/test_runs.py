@@ -119,6 +119,22 @@ def test_broken_runs_are_skipped_named_and_counted(tmp_path: Path, call: Callabl
     assert len(json.loads(call("--json").stdout)["skipped"]) == 5
 
 
+@pytest.mark.parametrize("name", [b"bytes-\xff\xfe", b"title-\x1b]0;x\x07", b"new\nline"])
+def test_a_name_that_cannot_be_printed_is_reported_and_hides_no_other_run(
+    tmp_path: Path, call: Callable[..., Result], name: bytes
+) -> None:
+    good, bad = make(tmp_path, 1), make(tmp_path, 2)
+    os.rename(os.fsencode(bad), os.path.join(os.fsencode(tmp_path), name))
+    found = listing.list_runs([tmp_path])
+    assert [path.name for path, _ in found.runs] == [good.name]
+    (reason,) = found.skipped
+    assert "printable characters" in reason
+    assert reason.isprintable()
+    for options in ([], ["--json"]):
+        result = call(tmp_path, *options)
+        assert (result.exit_code, good.name in result.output) == (0, True)
+
+
 @pytest.mark.parametrize("key", ["test", "created", "status", "campaign", "bench", "method", "errors", "results"])
 @pytest.mark.parametrize("value", [None, 7, [1], {"a": 1}, "\x1b[31m\n", 1e999])
 def test_damage_of_any_field_is_reported(tmp_path: Path, call: Callable[..., Result], key: str, value: Any) -> None:

@@ -43,6 +43,10 @@ class Folder:
         known, now = index.load(self.path), time.time_ns()
         self._kept = {} if whole else dict(known)
         for name in names:
+            if not (name.isprintable() and _is_text(self.path)):  # no page and no index can state it
+                found = ascii(str(self.path / name))
+                self.skipped[found] = f"{found}: expected a folder with a name of printable characters; rename it"
+                continue
             try:
                 stamp = _stamp(os.path.join(self.path, name))
                 if name in known and known[name][0] == stamp:
@@ -184,6 +188,15 @@ def _notes(
     if start is not None:
         found = [note for note in found if note.time is not None and note.time >= start]
     return tuple(sorted(found, key=lambda note: note.time or datetime.min.replace(tzinfo=UTC))), damaged
+
+
+def _is_text(path: Path) -> bool:
+    """Return whether a path is text in UTF-8; the bytes of a file name may be none."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _stamp(folder: str) -> Stamp:
