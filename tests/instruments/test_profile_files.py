@@ -68,12 +68,60 @@ def scan(path: Path, chosen: ProfileFileSettings | None = None) -> Scan:
 def test_a_point_cloud_becomes_a_height_map_to_the_rounding_of_its_file(
     tmp_path: Path, suffix: str, dtype: str
 ) -> None:
-    needed_open3d.open3d()
     found = scan(write_cloud(tmp_path / f"scan{suffix}", (1e3 * points()).astype(dtype)), MM)
     rounding = 1e-9 if suffix == ".xyz" or dtype == "f4" else 1e-12  # 2 mm in 24 bits: 0.1 nm; xyz: ten digits
     assert found.heights == pytest.approx(HEIGHTS, abs=rounding, nan_ok=True)
     assert found.x == pytest.approx(X, abs=rounding)
     assert found.y == pytest.approx(Y, abs=rounding)
+
+
+LINES = [f"{x:.3f} {y:.3f} {0.1 + x / 50 + y / 9:.5f}" for y in (0.0, 0.1, 0.2) for x in (0.0, 0.05, 0.1, 0.15)]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        "\n".join(LINES).encode(),
+        "\r\n".join(LINES).encode() + b"\r\n",
+        b"\xef\xbb\xbf" + "\n".join(LINES).encode(),
+        "\n".join(LINES).encode("utf-16"),
+        "\n\n".join(["# made by X", "// points", *LINES, ""]).replace(" ", "\t").encode(),
+    ],
+    ids=["no last line end", "CR LF", "byte order mark", "UTF-16", "comments, blank lines and tabs"],
+)
+def test_all_points_of_a_text_are_read(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "scan.xyz").write_bytes(data)
+    found = scan(tmp_path / "scan.xyz", MM)
+    expected = np.array([float(line.split()[2]) for line in LINES]).reshape(3, 4) * 1e-3
+    np.testing.assert_allclose(found.heights, expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("place", "line", "message"),
+    [
+        (1, "0 0 0,10000", r"line 1: expected three numbers separated by spaces; found '0 0 0,10000'; a decimal comma"),
+        (1, "X Y Z", r"line 1: expected three numbers .* found 'X Y Z'"),
+        (3, "0.05,0.1,0.12", r"line 3: .* found '0.05,0.1,0.12'"),
+        (5, "0.05 0.1 0.12mm", r"line 5: .* found '0.05 0.1 0.12mm'"),
+        (6, "0.05 0.1", r"line 6: .* found '0.05 0.1'"),
+        (2, "0.05 0.1 0.12 7", r"line 2: .* found '0.05 0.1 0.12 7'"),
+        (2, "0.05 0.1 1_2", r"line 2: .* found '0.05 0.1 1_2'"),
+    ],
+)
+def test_a_line_that_is_no_point_is_named(tmp_path: Path, place: int, line: str, message: str) -> None:
+    lines = [*LINES[: place - 1], line, *LINES[place - 1 :]]
+    (tmp_path / "scan.xyz").write_text("\n".join(lines))
+    with pytest.raises(InstrumentError, match=message):
+        scan(tmp_path / "scan.xyz", MM)
+
+
+def test_a_text_in_another_encoding_or_without_points_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scan.xyz").write_bytes("# Höhe\n0 0 0".encode("cp1252"))
+    with pytest.raises(InstrumentError, match="expected a text in UTF-8 or UTF-16"):
+        scan(tmp_path / "scan.xyz", MM)
+    (tmp_path / "scan.xyz").write_text("# nothing\n\n")
+    with pytest.raises(InstrumentError, match="expected points; found none"):
+        scan(tmp_path / "scan.xyz", MM)
 
 
 def test_a_csv_height_map_takes_its_pitches_from_the_settings(tmp_path: Path) -> None:

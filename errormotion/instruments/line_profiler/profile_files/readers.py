@@ -1,8 +1,8 @@
-"""Reading of scans as height maps in m: point clouds (PLY, PCD, XYZ) by Open3D, CSV, NetCDF."""
+"""Reading of scans as height maps in m: point clouds (PLY and PCD by Open3D, XYZ), CSV, NetCDF."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,8 +141,7 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     """Read a point cloud whose points lie on lines of equal y, with the same x on each."""
     unit = _unit(path, settings)
     open3d = _open3d(path)
-    if path.suffix.lower() != ".xyz":
-        check_complete(path)
+    check_complete(path)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     if "positions" not in cloud.point or not len(cloud.point.positions):
@@ -150,6 +149,57 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     points = cloud.point.positions.numpy().astype(np.float64)
     points[:, 2] = _with_nan(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
+
+
+def _read_xyz(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
+    """Read a point cloud as `_read_cloud`, from a text with a point on each line.
+
+    Open3D cuts a number at a decimal comma, loses the last line if it has no end, or ends the process.
+    """
+    unit = _unit(path, settings)
+    lines = _text(path).splitlines()
+    if not any(line.strip() and not line.lstrip().startswith(_COMMENTS) for line in lines):
+        raise InstrumentError(f"{path}: expected points; found none")
+    try:
+        points = np.loadtxt(lines, comments=_COMMENTS, ndmin=2, dtype=np.float64)
+    except ValueError:
+        points = np.empty((0, 0))
+    if points.shape[1:] != (3,):
+        raise InstrumentError(f"{path}, {_first_mistake(lines)}")
+    points[:, 2] = _with_nan(points[:, 2], settings)
+    return height_map(_in_metres(points, unit), path)
+
+
+_COMMENTS = ("#", "//")
+
+
+def _text(path: Path) -> str:
+    """Return a text in UTF-8, or in UTF-16 with a byte order mark."""
+    try:
+        require_regular(path)
+        data = path.read_bytes()
+        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InstrumentError(f"{path}: expected a text in UTF-8 or UTF-16; {error.reason}") from None
+    except OSError as error:
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def _first_mistake(lines: Sequence[str]) -> str:
+    """Return the place of the first line that is no point, and what was expected."""
+    for number, line in enumerate(lines, 1):
+        cells = line.partition(_COMMENTS[0])[0].partition(_COMMENTS[1])[0].split()
+        if cells and not (len(cells) == 3 and all(map(_is_number, cells))):
+            hint = "; a decimal comma is not read: write a point" if "," in line else ""
+            return f"line {number}: expected three numbers separated by spaces; found '{line.strip()[:60]}'{hint}"
+    return "expected three numbers on each line"
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return "_" not in cell and float(cell) is not None
+    except ValueError:
+        return False
 
 
 def _open3d(path: Path) -> Any:
@@ -267,7 +317,7 @@ Reader = Callable[[Path, ProfileFileSettings], tuple[Array, Array, Array]]
 READERS: Mapping[str, Reader] = {
     ".ply": _read_cloud,
     ".pcd": _read_cloud,
-    ".xyz": _read_cloud,
+    ".xyz": _read_xyz,
     ".csv": _read_csv,
     ".nc": _read_netcdf,
 }
