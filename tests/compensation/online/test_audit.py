@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -215,3 +216,27 @@ def test_the_key_is_for_its_user_only(log: Path, state: Path) -> None:
     key.symlink_to(log)
     with pytest.raises(audit.CompensationError, match="no other user can read"):
         AuditLog(log)
+
+
+@pytest.mark.parametrize("how", ["missing", "readable", "a link", "empty", "a pipe"])
+def test_without_a_usable_key_a_log_is_not_called_altered(log: Path, state: Path, how: str) -> None:
+    key = state / anchors.KEY
+    content = key.read_bytes()
+    key.unlink()
+    if how == "a link":
+        key.symlink_to(log)
+    elif how == "a pipe":
+        os.mkfifo(key, 0o600)
+    elif how != "missing":
+        key.touch(0o600)
+        key.write_bytes(content if how == "readable" else b"")
+        key.chmod(0o644 if how == "readable" else 0o600)
+    assert check(log).verdict is Verdict.WITHOUT_KEY
+    whole = log.read_bytes()
+    log.write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
+    assert check(log).verdict is Verdict.CUT  # the number of entries is known without the key
+    key.unlink(missing_ok=True)
+    key.touch(0o600)
+    key.write_bytes(content)
+    log.write_bytes(whole)
+    assert check(log).verdict is Verdict.UNBROKEN
