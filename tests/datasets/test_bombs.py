@@ -304,3 +304,9 @@ def test_an_empty_dimension_does_not_hide_the_size_of_another(tmp_path: Path) ->
     stated["shape"] = [1 << 40, 0]
     place.write_text(json.dumps(stated))
     refuse(path, r"expected at most \d+ bytes of values .* it states")
+
+
+def test_a_netcdf_file_with_64_bit_counts_is_refused_and_not_read_as_another_format(tmp_path: Path) -> None:
+    path = tmp_path / "cdf5.nc"
+    path.write_bytes(b"CDF\5" + bytes(64))
+    refuse(path, "is not a dataset")

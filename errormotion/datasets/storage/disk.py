@@ -29,7 +29,7 @@ _NETCDF = (".nc", ".nc4", ".h5")
 _NUMERICAL = ("/numpy/", "/scipy/")
 _READERS = ("/zarr/", "/numcodecs/", "/h5py/", "/h5netcdf/")
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_CLASSIC_SIGNATURE = b"CDF"
+_CLASSIC_SIGNATURES = (b"CDF\1", b"CDF\2")  # with 64-bit counts, CDF-5, scipy reads others than stated
 
 # Longer time coordinates get no index, which would load them into memory.
 _MAX_INDEX = 100_000
@@ -161,7 +161,7 @@ def _engine_of(path: Path) -> str:
         return "h5netcdf"
     if not head:
         raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Writing was interrupted: create it again")
-    if head.startswith(_CLASSIC_SIGNATURE):
+    if head.startswith(_CLASSIC_SIGNATURES):
         return "scipy"
     if _HDF5_SIGNATURE.startswith(head):
         raise DatasetError(f"{path}: is truncated; create it again or copy it again")
