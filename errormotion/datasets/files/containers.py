@@ -84,9 +84,9 @@ def check_netcdf(path: Path) -> None:
             found += [f"{name!r:.100}: {text}" for text in wrong_types(variable)]
             pieces, decoded = variable.chunks or (), any(each in variable.attrs for each in _DECODED)
             item = max(DECODED if decoded else 1, variable.id.get_type().get_size())
-            total += max(_number(variable.shape or ()), math.prod(pieces)) * item
-            if pieces:
-                total += math.prod(_counts(variable.shape, pieces)) * PER_CHUNK_OF_HDF5
+            chunks = math.prod(_counts(variable.shape, pieces)) if pieces else 0
+            values = max(_number(variable.shape or ()), math.prod(pieces)) * item
+            total += max(values, chunks * PER_CHUNK_OF_HDF5)
             variables[name] = variable
         found += [f"/: {text}" for text in wrong_types(file)]
         if not found and total <= _most(size):  # what follows reads as much as the file states
@@ -174,8 +174,8 @@ def check_zarr(path: Path) -> None:
         if wrong:
             found.append(f"{name!r:.100}: {wrong}")
             continue
-        total += _stated(metadata)
-        total += math.prod(_counts(metadata["shape"], _chunk_shape(metadata))) * PER_CHUNK_OF_ZARR
+        chunks = math.prod(_counts(metadata["shape"], _chunk_shape(metadata)))
+        total += max(_stated(metadata), chunks * PER_CHUNK_OF_ZARR)
         found += [f"{name!r:.100}: {text}" for text in _wrong_chunks(path / name, metadata, size)]
     _raise(path, found, total, size)
 
