@@ -51,7 +51,7 @@ SEARCHES = ((design, "_MAX_EVALUATIONS"), (layout, "_TRIED"), (layout, "_GLOBAL"
 
 def _line_of_make(command: str) -> str:
     """Return the command of ``make TARGET`` in the Makefile, to be run here instead of in the repository."""
-    outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS", "ARGS"))}
     recipe = subprocess.run(
         ["make", "-n", "-s", *command.split()[1:]], cwd=ROOT, env=outside, capture_output=True, text=True, check=True
     ).stdout
