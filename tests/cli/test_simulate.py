@@ -4,7 +4,7 @@ import json
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +55,15 @@ def device(commands: Commands, *arguments: Any) -> Iterator[tuple[Command, dict[
             process.send_signal(signal.SIGKILL)
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
+def free_port(lines: int = 1) -> int:
+    """Return a free port that is followed by as many more as further lines need."""
+    while True:
+        with ExitStack() as servers:
+            first = int(servers.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1])
+            with suppress(OSError, OverflowError):
+                for further in range(1, lines):
+                    servers.enter_context(socket.create_server(("127.0.0.1", first + further)))
+                return first
 
 
 def test_a_simulated_device_serves_several_clients_in_turn(commands: Commands) -> None:
@@ -91,7 +97,7 @@ def test_a_fault_is_one_of_the_device(commands: Commands) -> None:
 
 
 def test_all_lines_of_a_device_are_printed(commands: Commands) -> None:
-    port = free_port()
+    port = free_port(lines=2)
     with device(commands, "keyence_ljx", "--port", port) as (_, printed):
         assert printed["url"] == f"tcp://127.0.0.1:{port}"
         assert printed["lines"] == {"stream": f"tcp://127.0.0.1:{port + 1}"}
