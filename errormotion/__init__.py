@@ -3,6 +3,7 @@
 The packages from the lowest layer to the highest; a package imports only lower ones (checked by a contract):
 
 ``errors``        the exceptions of the package, with a common root
+``estimation``    least squares, covariances, smoothing, extremes, for arrays
 ``kinematics``    poses, twists, ISO 230-1 axes, machine chains, geometric fits, for arrays
 ``plugins``       contracts of instruments, methods and kinds of dataset; the registry
 ``datasets``      raw and error datasets: schemas, units, provenance, reading and writing

@@ -21,12 +21,13 @@ LAYERS = [
     [("datasets", "schemas, units, provenance, files")],
     [("plugins", "contracts and registry")],
     [("kinematics", "poses, twists, chains, fits")],
+    [("estimation", "least squares, covariances, extremes")],
 ]
 COLOURS = ("#dbe9f6", "#e8eef4")
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(7.6, 10.1), dpi=130)
+    figure, axes = plt.subplots(figsize=(7.6, 10.7), dpi=130)
     height, gap = 0.78, 0.22
     for level, row in enumerate(reversed(LAYERS)):
         width = 8.0 / len(row)

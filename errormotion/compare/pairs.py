@@ -8,8 +8,8 @@ import numpy as np
 from scipy import special
 
 from errormotion.arrays import Array
-from errormotion.compare.low_rank import whitener
 from errormotion.compare.stack import Estimate, difference
+from errormotion.estimation.low_rank import whitener
 
 COVERAGE_FACTOR = 2.0
 """k of the expanded uncertainties in En."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.compare.diagnosis.shift import fitted, smooth
-from errormotion.compare.low_rank import whitener
+from errormotion.estimation.low_rank import whitener
 
 SIZE, NOISE = np.array([10e-6, 5e-6, 20e-6]), 1e-7
 LATE = 183.0

@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import kstest
 
 from errormotion.compare.consensus import consensus, random_effects
-from errormotion.compare.low_rank import whitener
 from errormotion.compare.normal import Information, Reduced, short, solve
 from errormotion.compare.pairs import pair
 from errormotion.compare.stack import Estimate, gathered
+from errormotion.estimation.low_rank import whitener
 
 N, D = 9, 4
 SCALE = np.array([1e-6, 2e-6, 5e-6, 1e-5])

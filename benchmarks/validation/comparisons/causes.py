@@ -15,11 +15,11 @@ from scipy.stats import chi2, ncx2
 from errormotion.compare import compare
 from errormotion.compare.diagnosis.causes import FACTORS, TURNS
 from errormotion.compare.ground import common_ground
-from errormotion.compare.low_rank import whitener
 from errormotion.compare.stack import difference
 from errormotion.datasets import DOF
 from errormotion.datasets.timing import later
 from errormotion.errors import DatasetError
+from errormotion.estimation.low_rank import whitener
 from errormotion.kinematics import twists
 from errormotion.twin import VirtualMachine
 from validation.comparisons.drawn import Drawn, at

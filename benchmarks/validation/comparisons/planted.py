@@ -13,10 +13,10 @@ from scipy.stats import chi2, kstest, ncx2
 from errormotion.compare import compare, explain
 from errormotion.compare.diagnosis import SCORE_MARGIN
 from errormotion.compare.ground import common_ground
-from errormotion.compare.low_rank import whitener
 from errormotion.compare.pairs import pair as judged
 from errormotion.compare.stack import difference
 from errormotion.datasets.timing import later
+from errormotion.estimation.low_rank import whitener
 from errormotion.kinematics import twists
 from validation.comparisons.drawn import Drawn, at
 from validation.comparisons.pool import Pool

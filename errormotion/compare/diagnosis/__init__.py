@@ -26,9 +26,9 @@ from scipy import special
 from errormotion.arrays import Array
 from errormotion.compare.diagnosis.causes import Added, AnyCause, Mapped, Read, Shifted, Side, candidates
 from errormotion.compare.diagnosis.shift import Course, fitted
-from errormotion.compare.low_rank import Whitener, whitener
 from errormotion.compare.placed import Stored
 from errormotion.compare.stack import Estimate, difference
+from errormotion.estimation.low_rank import Whitener, whitener
 from errormotion.kinematics.iso import DOF
 
 SCORE_MARGIN = 6.0

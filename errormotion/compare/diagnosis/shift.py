@@ -19,8 +19,8 @@ import xarray as xr
 from scipy.interpolate import BSpline, splrep
 
 from errormotion.arrays import Array, products
-from errormotion.compare.low_rank import Whitener
 from errormotion.datasets.results.reduction import influence_of
+from errormotion.estimation.low_rank import Whitener
 from errormotion.kinematics.iso import DOF
 
 MIN_SHIFT = 1.0

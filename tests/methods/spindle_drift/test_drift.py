@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from errormotion.compare.low_rank import whitener
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
+from errormotion.estimation.low_rank import whitener
 from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
 from errormotion.twin import Event, VirtualMachine
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.compare.low_rank import whitener
+from errormotion.estimation.low_rank import whitener
 
 N, D = 7, 3
 SCALE = np.array([1e-6, 3e-6, 2e-5])

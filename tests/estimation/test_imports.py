@@ -1,0 +1,13 @@
+import subprocess
+import sys
+from pkgutil import iter_modules
+
+from errormotion import estimation
+
+
+def test_no_module_imports_a_slow_package() -> None:
+    names = [f"errormotion.estimation.{module.name}" for module in iter_modules(estimation.__path__)]
+    assert names
+    program = f"import sys, {', '.join(names)}\nprint([n for n in ('scipy.stats', 'numba', 'xarray') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
