@@ -4,10 +4,12 @@ from pkgutil import iter_modules
 
 from errormotion import estimation
 
+SLOW = ("scipy.stats", "numba", "xarray")
+
 
 def test_no_module_imports_a_slow_package() -> None:
     names = [f"errormotion.estimation.{module.name}" for module in iter_modules(estimation.__path__)]
     assert names
-    program = f"import sys, {', '.join(names)}\nprint([n for n in ('scipy.stats', 'numba', 'xarray') if n in sys.modules])"
+    program = f"import sys, {', '.join(names)}\nprint([name for name in {SLOW} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
