@@ -1,0 +1,227 @@
+"""Nonlinear generalised least squares with priors: Gauss-Newton on a problem stated by its equation.
+
+The objective is ``Q = r' V^-1 r + sum ((x - x0) / sd)^2`` over readings and priors. Each step solves the normal
+equations of the linearised problem and is halved until Q decreases. The iteration ends by the Newton decrement
+``g' step``, the decrease of Q that the next step promises, and not by the size of the step: it has no unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.blocks import Block
+from errormotion.estimation.derivatives import column
+from errormotion.estimation.normal import Normal, SingularError
+from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised
+
+__all__ = ["Fit", "fit"]
+
+DECREMENT = 1e-14
+"""Newton decrement that ends the iteration, in units of the variance factor: 1e-7 standard uncertainties.
+
+The step after it is made as well, so that the remaining error is far smaller.
+"""
+STALLED = 1e-10
+"""Newton decrement below which a step that gains no further digit is due to rounding."""
+MAX_ITERATIONS = 50
+HALVINGS = 20
+EPS = float(np.finfo(float).eps)
+ROUNDING = 1e-12
+"""Increase of Q, relative to Q, that is regarded as rounding."""
+_ROWS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted problem. Covariances are for the noise as stated, times ``factor``.
+
+    Attributes
+    ----------
+    linear : Linear
+        The problem, linearised at the solution.
+    normal : Normal
+        Its factorised normal equations.
+    """
+
+    linear: Linear
+    normal: Normal
+
+    @property
+    def problem(self) -> Problem:
+        """The problem that was fitted."""
+        return self.linear.problem
+
+    @property
+    def unknowns(self) -> Any:
+        """The tables (size, width) of all unknowns, as a named tuple."""
+        return type(self.problem.unknowns)(*self.linear.at.tables)
+
+    @property
+    def constants(self) -> Any:
+        """The tables of all constants, the adjusted ones at their new values."""
+        tables = self.problem.constant_tables(self.linear.at)
+        return type(self.problem.constants)(*tables) if tables else ()
+
+    @property
+    def residual(self) -> Array:
+        """Residuals of the equation, (n, m); NaN where missing."""
+        return self.problem.residuals(self.linear.at)
+
+    @property
+    def chi2(self) -> float:
+        """Q: weighted sum of squares of the readings and priors."""
+        return self.linear.chi2 + self.linear.prior_square()
+
+    @cached_property
+    def freedom(self) -> int:
+        """Degrees of freedom: used numbers, plus priors, minus unknowns, plus the freedoms of the gauge."""
+        priors = unknowns = 0
+        for block in self.problem.unknowns:
+            priors += int(np.count_nonzero(block.information[block.freed]))
+            unknowns += int(block.freed.sum())
+        gauge = self.problem.gauge
+        free = len(next(iter(gauge.values()))) if gauge else 0
+        return int(self.linear.used.sum()) + priors - unknowns + free
+
+    @cached_property
+    def leverage(self) -> Array:
+        """Diagonal of the hat matrix of the whitened numbers, (n, m): 1 minus the redundancy of each.
+
+        A chain without border couples neighbours; its leverage is that of all rows together.
+        """
+        linear, normal = self.linear, self.normal
+        n, m = linear.used.shape
+        found = np.zeros((n, m))
+        b = linear.columns.shape[1]
+        root = np.concatenate([normal.root, np.zeros((1, normal.root.shape[1]))])
+        # J C J' = J_L own J_L' + E E' with E = (J_B - J_L F) root
+        for first in range(0, n, _ROWS):
+            part = slice(first, first + _ROWS)
+            E = np.einsum("nmb,nbr->nmr", linear.border[part], root[linear.columns[part]]) if b else 0.0
+            if linear.numbering.local is not None:
+                index = linear.problem.unknowns[linear.numbering.local].index2[part]
+                E = E + np.einsum("nmwp,nwpr->nmr", linear.local[part], normal.shared[index])
+            if np.ndim(E):
+                found[part] += np.einsum("nmr,nmr->nm", E, E)
+        if linear.numbering.local is not None:
+            found += self._local_leverage()
+        return found
+
+    def _local_leverage(self) -> Array:
+        linear = self.linear
+        block: Block = linear.problem.unknowns[linear.numbering.local]
+        index, w = block.index2, linear.local.shape[2]
+        found = np.zeros(linear.used.shape)
+        for i in range(w):
+            for j in range(w):
+                C = self.normal.local_covariance(index[:, i], index[:, j])
+                found += np.einsum("nmk,nkl,nml->nm", linear.local[:, :, i], C, linear.local[:, :, j])
+        return found
+
+
+def fit(
+    problem: Problem, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
+) -> Fit:
+    """Return the unknowns that minimise the weighted sum of squares.
+
+    Parameters
+    ----------
+    problem : Problem
+    refresh : callable, optional
+        From the problem and the unknowns after a step (a named tuple of tables) to the problem of the next step, whose
+        frozen quantities (normals, centres, weights) follow the unknowns.
+    what : str
+        What the readings are, for messages.
+
+    Raises
+    ------
+    FitError
+        The readings do not determine the unknowns, which are named; or the iteration has not converged.
+    """
+    number = Numbering.of(problem)
+    at = problem.start
+    last = np.inf
+    for _ in range(MAX_ITERATIONS):
+        linear = linearised(problem, at, number)
+        step, decrement = _step(linear, what)
+        at = _descended(linear, step)
+        unit = _unit(linear)
+        if refresh is not None:
+            problem = refresh(problem, type(problem.unknowns)(*at.tables))
+        if decrement <= DECREMENT * unit or (decrement > 0.1 * last and decrement <= STALLED * unit):
+            break
+        last = decrement
+    else:
+        raise FitError(
+            f"the fit to {what} has not converged after {MAX_ITERATIONS} iterations (the next step would still "
+            f"decrease the sum of squares by {decrement:.2g}). Check units and the order of the readings"
+        )
+    linear = linearised(problem, at, number)
+    return Fit(linear, linear.normal()[0])
+
+
+def _step(linear: Linear, what: str) -> tuple[tuple[Array, Array], float]:
+    """Return the step (R, p), (q,), and the Newton decrement."""
+    try:
+        normal, a, b = linear.normal()
+    except SingularError as error:
+        raise _undetermined(linear, error, what) from error
+    x, z = normal.solve(a[..., None], b[..., None])
+    decrement = float(np.vdot(a, x[..., 0]) + b @ z[:, 0])
+    return (x[..., 0], z[:, 0]), decrement
+
+
+def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
+    """Return the unknowns after the step, or after the largest half of it that does not increase the sum."""
+    before = linear.chi2 + linear.prior_square()
+    fraction = 1.0
+    for _ in range(HALVINGS):
+        at = linear.moved(fraction * step[0], fraction * step[1])
+        if _square(linear, at) <= before * (1 + ROUNDING) + ROUNDING:
+            return at
+        fraction /= 2
+    return linear.moved(fraction * step[0], fraction * step[1])
+
+
+def _square(linear: Linear, at: Unknown) -> float:
+    """Return the sum of squares at other values of the unknowns, with the weights of the linearisation."""
+    raw = np.where(linear.used, linear.problem.residuals(at), 0.0)
+    r = (linear.whitener @ raw[..., None])[..., 0]
+    moved = Linear(
+        linear.problem, at, linear.numbering, r, linear.used, linear.whitener, linear.local, linear.border,
+        linear.columns,
+    )  # fmt: skip
+    found = moved.chi2 + moved.prior_square()
+    return found if np.isfinite(found) else np.inf
+
+
+def _unit(linear: Linear) -> float:
+    """Return the variance factor of the readings, at least that of the rounding of their numbers."""
+    used = max(int(linear.used.sum()), 1)
+    y = column(linear.problem.y)
+    size = np.abs(linear.whitener).sum(axis=2) * np.abs(y).max(axis=1, initial=0.0, keepdims=True)
+    rounding = float(np.sum(np.square(EPS * size))) / used
+    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, rounding)
+
+
+def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:
+    """Return the error that names the unknowns which the readings do not determine."""
+    problem, number = linear.problem, linear.numbering
+    names = []
+    if error.rows.size and number.local is not None:
+        name = problem.unknowns._fields[number.local]
+        some = ", ".join(str(row + 1) for row in error.rows[:5]) + (", ..." if error.rows.size > 5 else "")
+        names.append(f"{name} {some}")
+    for name, border in zip(problem.unknowns._fields, number.border, strict=True):
+        if border.size and np.isin(border, error.columns).any():
+            rows = np.flatnonzero(np.isin(border, error.columns).any(axis=1))
+            some = ", ".join(str(row + 1) for row in rows[:5]) + (", ..." if rows.size > 5 else "")
+            names.append(f"{name} {some}")
+    return FitError(f"{what} do not determine {' and '.join(names) or 'all unknowns'}. Measure more, or elsewhere")

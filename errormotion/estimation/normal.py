@@ -1,0 +1,229 @@
+"""Normal equations of local unknowns, coupled along a chain, and of a border that all of them share.
+
+    [T  G] [x]   [a]
+    [G' D] [z] = [b]
+
+T is banded over the rows of one table (targets, cycles, instants; without coupling it is block diagonal), z are all
+other unknowns. Elimination proceeds along the rows, so that time and memory are proportional to their number; with
+``F = T^-1 G`` the border has the normal matrix ``S = D - G' F``. The rows of a band are joined to blocks, which makes T
+block tridiagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.estimation.blocks import Index
+
+__all__ = ["Normal", "SingularError", "factorised"]
+
+SINGULAR = 1e-13
+"""Smallest pivot of the border, scaled to a diagonal of 1, that is not regarded as rounding."""
+
+
+class SingularError(ValueError):
+    """The equations have no unique solution: ``rows`` of the local unknowns, or ``columns`` of the border."""
+
+    def __init__(self, rows: Index, columns: Index) -> None:
+        self.rows, self.columns = rows, columns
+        super().__init__(f"{rows.size} local rows and {columns.size} columns of the border are undetermined")
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Factorised normal equations of R local rows with p unknowns each, and of a border of q.
+
+    Attributes
+    ----------
+    F : ndarray, (R, p, q)
+        ``T^-1 G``.
+    S : ndarray, (q, q)
+        Normal matrix of the border after elimination.
+    root : ndarray, (q, r)
+        A square root of the covariance of the border, ``S^-1``; within the complement of the gauge.
+    """
+
+    F: Array
+    S: Array
+    root: Array
+    _inverses: Array  # (B, s p, s p): diagonal blocks of T^-1
+    _pivots: Array  # (B, s p, s p): inverse pivots P_k^-1 of the blocks of s rows
+    _back: Array  # (B - 1, s p, s p): P_k^-1 times the coupling C_k with the next block
+    _G: Array
+
+    @cached_property
+    def own(self) -> Array:
+        """Covariance of each local row for a known border, (R, p, p)."""
+        rows = np.arange(len(self.F))
+        return self.local_covariance(rows, rows)
+
+    def local_covariance(self, i: Index, j: Index) -> Array:
+        """Return the covariances of the local rows i and j for a known border, (k, p, p); at most a band apart."""
+        p = self.F.shape[1]
+        s = self._inverses.shape[1] // p if p else 1
+        parts = self._inverses.reshape(-1, s, p, s, p)
+        block, to = i // s, j // s
+        found = parts[block, i % s, :, j % s]
+        if self._back.any():
+            # (T^-1)_(k,k+1) = -P_k^-1 C_k (T^-1)_(k+1,k+1)
+            beside = -(self._back @ self._inverses[1:]).reshape(-1, s, p, s, p)
+            for k, sign in ((np.flatnonzero(to == block + 1), 1), (np.flatnonzero(to == block - 1), -1)):
+                low, inside, outside = (block, i, j) if sign > 0 else (to, j, i)
+                one = beside[low[k], inside[k] % s, :, outside[k] % s]
+                found[k] = one if sign > 0 else np.swapaxes(one, 1, 2)
+            found[np.abs(to - block) > 1] = np.nan
+        else:
+            found[to != block] = 0.0
+        return np.asarray(found)
+
+    @property
+    def covariance(self) -> Array:
+        """Of the border, (q, q)."""
+        return np.asarray(self.root @ self.root.T)
+
+    @property
+    def shared(self) -> Array:
+        """Effect of the r independent parts of the border on each local row, (R, p, r)."""
+        return np.asarray(-self.F @ self.root)
+
+    def solve(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Return the solutions (R, p, k) and (q, k) for right sides of the same shapes."""
+        y = _swept(self._pivots, self._back, a)
+        z = self.root @ (self.root.T @ (b - np.tensordot(self._G, y, axes=((0, 1), (0, 1)))))
+        return y - self.F @ z, z
+
+
+def factorised(band: Sequence[Array], G: Array, D: Array, gauge: Array | None = None) -> Normal:
+    """Factorise normal equations.
+
+    Parameters
+    ----------
+    band : sequence of ndarray, (R, p, p)
+        Coupling of each row with itself, the next, the second next, ...; entries beyond the last row are ignored.
+    G : ndarray, (R, p, q)
+    D : ndarray, (q, q)
+    gauge : ndarray, (q, g), optional
+        Changes of the border that no reading sees; the solution has no component along them.
+
+    Raises
+    ------
+    SingularError
+    """
+    R, p = G.shape[:2]
+    s = max(len(band) - 1, 1)
+    blocks = -(-R // s)
+    diagonal, after = _superblocks(band, R, p, s, blocks)
+    pivots, back = _eliminated(diagonal, after, s, R)
+    F = _swept(pivots, back, G)
+    S = D - np.tensordot(G, F, axes=((0, 1), (0, 1)))
+    S = (S + S.T) / 2
+    return Normal(F, S, _root(S, D, gauge), _inverses(pivots, back), pivots, back, G)
+
+
+def _superblocks(band: Sequence[Array], R: int, p: int, s: int, blocks: int) -> tuple[Array, Array]:
+    """Return the diagonal blocks (B, s p, s p) of s rows each, and their coupling with the next block."""
+    rows = blocks * s
+    diagonal = np.zeros((blocks, s, p, s, p))
+    after = np.zeros((max(blocks - 1, 0), s, p, s, p))
+    filled = [np.concatenate([each, np.zeros((rows - R + s, p, p))])[: rows + s] for each in band]
+    if rows > R:
+        filled[0][R:rows] = np.eye(p)
+    for i in range(s):
+        diagonal[:, i, :, i] = filled[0][i:rows:s]
+        for d in range(1, len(band)):
+            each = filled[d][i:rows:s]
+            each = np.where((np.arange(i, rows, s) + d < R)[:, None, None], each, 0.0)
+            j = i + d
+            if j < s:
+                diagonal[:, i, :, j] = each
+                diagonal[:, j, :, i] = np.swapaxes(each, 1, 2)
+            elif blocks > 1:
+                after[:, i, :, j - s] = each[:-1]
+    size = s * p
+    return diagonal.reshape(blocks, size, size), after.reshape(len(after), size, size)
+
+
+def _eliminated(diagonal: Array, after: Array, s: int, R: int) -> tuple[Array, Array]:
+    """Return the inverse pivots (B, sp, sp), and ``pivot^-1 after`` of each block with a successor."""
+    if not after.any():
+        return _inverted(diagonal, np.arange(len(diagonal)), s, R), np.zeros_like(after)
+    inverse, back = np.empty_like(diagonal), np.empty_like(after)
+    inverse[0] = _inverted(diagonal[:1], np.array([0]), s, R)[0]
+    for k in range(1, len(diagonal)):
+        back[k - 1] = inverse[k - 1] @ after[k - 1]
+        pivot = diagonal[k] - after[k - 1].T @ back[k - 1]
+        inverse[k] = _inverted(pivot[None], np.array([k]), s, R)[0]
+    return inverse, back
+
+
+def _inverted(matrices: Array, number: Index, s: int, R: int) -> Array:
+    """Return inverses of symmetric matrices, scaled to a diagonal of 1 first; singular ones raise an error."""
+    diagonal = np.diagonal(matrices, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = matrices * scale[:, :, None] * scale[:, None, :]
+    try:
+        root = np.linalg.cholesky(scaled)
+        smallest = np.diagonal(root, axis1=1, axis2=2) ** 2
+    except np.linalg.LinAlgError:
+        smallest = np.linalg.eigvalsh(scaled)
+    bad = np.flatnonzero(smallest.min(axis=1, initial=1.0) <= SINGULAR)
+    if bad.size:
+        rows = np.concatenate([number[k] * s + np.arange(s) for k in bad])
+        raise SingularError(rows[rows < R], np.zeros(0, dtype=int))
+    found = np.linalg.inv(scaled)
+    found = (found + np.swapaxes(found, 1, 2)) / 2
+    return np.asarray(found * scale[:, :, None] * scale[:, None, :])
+
+
+def _inverses(pivots: Array, back: Array) -> Array:
+    """Return the diagonal blocks of ``T^-1`` by backward recursion, (B, s p, s p)."""
+    inverse = pivots.copy()
+    if back.any():
+        for k in range(len(pivots) - 2, -1, -1):
+            # (T^-1)_kk = P_k^-1 + (P_k^-1 C_k) (T^-1)_(k+1,k+1) (P_k^-1 C_k)'
+            inverse[k] += back[k] @ inverse[k + 1] @ back[k].T
+    return inverse
+
+
+def _swept(pivots: Array, back: Array, a: Array) -> Array:
+    """Return ``T^-1 a`` for (R, p, k)."""
+    R, p, k = a.shape
+    size = pivots.shape[1] if len(pivots) else p
+    rows = len(pivots) * size // p
+    right = np.concatenate([a, np.zeros((rows - R, p, k))]).reshape(len(pivots), size, k)
+    if not back.any():
+        return np.asarray((pivots @ right).reshape(rows, p, k)[:R])
+    right = right.copy()
+    for j in range(1, len(pivots)):
+        right[j] -= back[j - 1].T @ right[j - 1]
+    y = pivots @ right
+    for j in range(len(pivots) - 2, -1, -1):
+        y[j] -= back[j] @ y[j + 1]
+    return np.asarray(y.reshape(rows, p, k)[:R])
+
+
+def _root(S: Array, D: Array, gauge: Array | None) -> Array:
+    """Return a square root of the covariance of the border, without the gauge."""
+    q = len(S)
+    if not q:
+        return np.zeros((0, 0))
+    diagonal = np.diagonal(D)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = S * scale[:, None] * scale
+    Z = np.eye(q)
+    if gauge is not None and gauge.size:
+        # Changes along the gauge, in scaled unknowns; the solution is in their orthogonal complement.
+        full, _ = np.linalg.qr(gauge / scale[:, None], mode="complete")
+        Z = full[:, gauge.shape[1] :]
+    inner = Z.T @ scaled @ Z
+    power, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    if power[0] <= SINGULAR * max(power[-1], 1.0):
+        lost = Z @ vectors[:, power <= SINGULAR * max(power[-1], 1.0)]
+        columns = np.flatnonzero(np.abs(lost).max(axis=1) > 0.1 * np.abs(lost).max())
+        raise SingularError(np.zeros(0, dtype=int), columns)
+    return np.asarray(scale[:, None] * (Z @ (vectors / np.sqrt(power))))

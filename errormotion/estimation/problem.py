@@ -1,0 +1,422 @@
+"""A least-squares problem stated by its equation: linearisation, whitening, and the sums of the normal equations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.blocks import Block, Constant, Index, Noise, Table
+from errormotion.estimation.derivatives import along, by_rows, column
+from errormotion.estimation.normal import Normal, factorised
+
+__all__ = ["Linear", "Problem", "linearised"]
+
+DENSE = 150
+"""Largest number of unknowns that are all kept in the border: no elimination is faster for so few."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem:
+    """Readings, and the equation that they fulfil but for their noise.
+
+    Attributes
+    ----------
+    equation : callable
+        ``equation(y, x, c)`` returns the residuals, (n,) or (n, m), which are 0 without noise: reading minus predicted,
+        or any other condition. y are the readings as given; x and c are named tuples of the same types as
+        ``unknowns`` and ``constants``, with the rows that each reading sees in place of the tables.
+    readings : ndarray, (n,) or (n, r)
+        NaN = missing. A missing number of a vector reading makes the residuals that depend on it missing.
+    unknowns : named tuple of Block
+    constants : named tuple of Constant
+        May be empty.
+    noise : Noise
+    reading_scale : float or ndarray, (r,)
+        The change of a reading over which the equation bends noticeably; see `Table.scale`.
+    gauge : mapping of str to ndarray, (g, size, width), optional
+        Changes of unknowns by name that no reading sees, such as a motion of a whole network.
+    derivatives : callable, optional
+        ``derivatives(y, x, c)`` returns analytic derivatives of the residuals, (n, m, width) or (n, m, w, width), by
+        name, for any of the unknowns; those of the others are differences.
+    """
+
+    equation: Callable[[Array, Any, Any], Array]
+    readings: Array
+    unknowns: Any
+    constants: Any = ()
+    noise: Noise
+    reading_scale: float | Array = 1.0
+    gauge: Mapping[str, Array] | None = None
+    derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
+
+    @cached_property
+    def y(self) -> Array:
+        """Readings with 0 for missing ones, in their own shape."""
+        return np.where(np.isfinite(self.readings), self.readings, 0.0)
+
+    @cached_property
+    def start(self) -> Unknown:
+        """Start of all unknowns, and 0 for the adjusted constants."""
+        return Unknown(
+            [block.start.copy() for block in self.unknowns], [np.zeros(c.sources) for c in self.adjusted.values()]
+        )
+
+    @cached_property
+    def adjusted(self) -> dict[int, Constant]:
+        """Constants that the readings may improve, by their position."""
+        return {k: constant for k, constant in enumerate(self.constants) if constant.adjust and constant.sources}
+
+    def constant_tables(self, at: Unknown) -> list[Array]:
+        """Return the tables of the constants, with the adjusted ones at their present values."""
+        tables = [constant.value for constant in self.constants]
+        for (k, constant), z in zip(self.adjusted.items(), at.adjusted, strict=True):
+            tables[k] = constant.value + constant.factor @ z
+        return tables
+
+    def named(self, x: list[Array], c: list[Array]) -> tuple[Any, Any]:
+        """Return values as the named tuples that the equation receives."""
+        return _like(self.unknowns, x), _like(self.constants, c)
+
+    def evaluate(self, y: Array, rows: list[Array]) -> Array:
+        """Return the residuals for the rows of all unknowns and constants."""
+        count = len(self.unknowns)
+        return self.equation(y, *self.named(rows[:count], rows[count:]))
+
+    @property
+    def tables(self) -> list[Table]:
+        """All tables: unknowns, then constants."""
+        return [*self.unknowns, *self.constants]
+
+    def residuals(self, at: Unknown) -> Array:
+        """Return the residuals (n, m); NaN where a reading is missing."""
+        values = [*at.tables, *self.constant_tables(at)]
+        rows = [table.rows(value) for table, value in zip(self.tables, values, strict=True)]
+        found = column(self.evaluate(self.y, rows))
+        missing = ~np.isfinite(column(self.readings))
+        if not missing.any():
+            return found
+        if found.shape[1] == missing.shape[1]:
+            return np.where(missing, np.nan, found)
+        return np.where(missing.any(axis=1, keepdims=True), np.nan, found)
+
+    def without(self, wrong: NDArray[np.bool_]) -> Problem:
+        """Return the problem without the readings ``wrong``, in the shape of the readings or (n,)."""
+        mask = wrong if wrong.shape == self.readings.shape else np.broadcast_to(wrong[:, None], self.readings.shape)
+        return replace(self, readings=np.where(mask, np.nan, self.readings))
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """Values of all unknowns: the table of each block, and the sources of each adjusted constant."""
+
+    tables: list[Array]
+    adjusted: list[Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Numbering:
+    """The numbers of the unknowns: rows of the eliminated block ``local``, and columns of the border.
+
+    Attributes
+    ----------
+    local : int or None
+        The block that is eliminated.
+    border : list of ndarray, (size, width)
+        The number of every unknown in the border, by block; q = not estimated. Empty for the local block.
+    adjusted : list of ndarray, (k,)
+        Numbers of the sources of the adjusted constants.
+    size : int
+        q, the size of the border.
+    band : int
+        How many rows further the coupling of the local block reaches; 0 = none.
+    """
+
+    local: int | None
+    border: list[Index]
+    adjusted: list[Index]
+    size: int
+    band: int
+
+    @classmethod
+    def of(cls, problem: Problem) -> Numbering:
+        """Return the numbering: the largest block is eliminated, if there are many unknowns."""
+        counts = [int(block.freed.sum()) for block in problem.unknowns]
+        local = None
+        if sum(counts) > DENSE:
+            local = max(range(len(counts)), key=counts.__getitem__)
+        position, border = 0, []
+        for k, block in enumerate(problem.unknowns):
+            number = np.zeros((0, 0), dtype=np.intp)
+            if k != local:
+                number = np.full(block.start.shape, -1, dtype=np.intp)
+                number[block.freed] = position + np.arange(counts[k])
+                position += counts[k]
+            border.append(number)
+        adjusted = []
+        for constant in problem.adjusted.values():
+            adjusted.append(position + np.arange(constant.sources))
+            position += constant.sources
+        for number in border:
+            number[number < 0] = position
+        band = 0 if local is None else _band(problem.unknowns[local])
+        return cls(local, border, adjusted, position, band)
+
+
+def _band(block: Block) -> int:
+    """Return the largest distance of rows that one reading sees."""
+    index = block.index2
+    if index.shape[1] == 1:
+        return 0
+    if block.weight is None:
+        return int((index.max(axis=1) - index.min(axis=1)).max(initial=0))
+    used = block.weight != 0
+    high = np.where(used, index, -1).max(axis=1)
+    low = np.where(used, index, len(block.start)).min(axis=1)
+    return int(np.maximum(high - low, 0).max(initial=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A problem linearised about values of its unknowns, in units of the noise.
+
+    Attributes
+    ----------
+    residual : ndarray, (n, m)
+        0 where missing.
+    used : ndarray of bool, (n, m)
+    whitener : ndarray, (n, m, m)
+        The inverse of a square root of the covariance of the residuals of each reading.
+    local : ndarray, (n, m, w, p)
+        Derivatives by the rows of the eliminated block; w = 0 without one.
+    border : ndarray, (n, m, b)
+        Derivatives by the b unknowns of the border that a reading sees.
+    columns : ndarray of int, (n, b)
+        Their numbers.
+    """
+
+    problem: Problem
+    at: Unknown
+    numbering: Numbering
+    residual: Array
+    used: NDArray[np.bool_]
+    whitener: Array
+    local: Array
+    border: Array
+    columns: Index
+
+    @property
+    def chi2(self) -> float:
+        """Sum of the squared whitened residuals."""
+        return float(np.vdot(self.residual, self.residual))
+
+    def normal(self) -> tuple[Normal, Array, Array]:
+        """Return the factorised normal equations, and their right sides (R, p) and (q,) for the next step."""
+        number, q = self.numbering, self.numbering.size
+        band, G, D = self.sums()
+        a, b = self.gradient(self.residual)
+        problem = self.problem
+        if number.local is not None:
+            block = problem.unknowns[number.local]
+            prior = np.where(block.freed, block.information, 1.0)
+            band[0] += prior[:, :, None] * np.eye(prior.shape[1])
+            a = np.where(block.freed, a + block.information * (self.at.tables[number.local] - block.start), 0.0)
+        prior, offset = self._border_prior()
+        D[np.arange(q), np.arange(q)] += prior
+        normal = factorised(band, G, D, self._gauge())
+        return normal, -a, -(b + prior * offset)
+
+    def sums(self) -> tuple[list[Array], Array, Array]:
+        """Return the sums of products of derivatives: the band of T, G, and D."""
+        number, q = self.numbering, self.numbering.size
+        b = self.columns.shape[1]
+        pairs = np.einsum("nmi,nmj->nij", self.border, self.border)
+        rows = np.broadcast_to(self.columns[:, :, None], pairs.shape)
+        cols = np.broadcast_to(self.columns[:, None, :], pairs.shape)
+        D = _summed(rows * (q + 1) + cols, pairs, (q + 1) ** 2).reshape(q + 1, q + 1)[:q, :q]
+        if number.local is None:
+            return [np.zeros((0, 1, 1))], np.zeros((0, 1, q)), D
+        block = problem_block(self)
+        R, p = block.start.shape
+        index, A = block.index2, self.local
+        w = A.shape[2]
+        band = [np.zeros((R, p, p)) for _ in range(number.band + 1)]
+        G = np.zeros((R, p, q + 1))
+        inner = np.arange(p * p).reshape(p, p)
+        for i in range(w):
+            for j in range(w):
+                ahead = index[:, j] - index[:, i]
+                chosen = (ahead >= 0) & (ahead <= number.band)
+                if not chosen.any():
+                    continue
+                product = np.einsum("nmk,nml->nkl", A[chosen, :, i], A[chosen, :, j])
+                for d in np.unique(ahead[chosen]):
+                    part = ahead[chosen] == d
+                    at = index[chosen, i][part]
+                    band[d] += _summed(at[:, None, None] * (p * p) + inner, product[part], R * p * p).reshape(R, p, p)
+            if b:
+                product = np.einsum("nmk,nmb->nkb", A[:, :, i], self.border)
+                flat = (index[:, i, None, None] * p + np.arange(p)[:, None]) * (q + 1) + self.columns[:, None, :]
+                G += _summed(flat, product, R * p * (q + 1)).reshape(R, p, q + 1)
+        return band, G[..., :q], D
+
+    def gradient(self, residual: Array) -> tuple[Array, Array]:
+        """Return ``J' r`` for whitened numbers (n, m) or (n, m, k): (R, p[, k]) and (q[, k])."""
+        single = residual.ndim == 2
+        r = residual[..., None] if single else residual
+        k, q = r.shape[2], self.numbering.size
+        product = np.einsum("nmb,nmk->nbk", self.border, r)
+        flat = self.columns[:, :, None] * k + np.arange(k)
+        b = _summed(flat, product, (q + 1) * k).reshape(q + 1, k)[:q]
+        if self.numbering.local is None:
+            a = np.zeros((0, 1, k))
+        else:
+            block = problem_block(self)
+            R, p = block.start.shape
+            product = np.einsum("nmwp,nmk->nwpk", self.local, r)
+            flat = (block.index2[:, :, None, None] * p + np.arange(p)[:, None]) * k + np.arange(k)
+            a = _summed(flat, product, R * p * k).reshape(R, p, k)
+        return (a[..., 0], b[..., 0]) if single else (a, b)
+
+    def effect(self, a: Array, b: Array) -> Array:
+        """Return ``J x`` for changes of the unknowns (R, p, k) and (q, k): the change of the residuals, (n, m, k)."""
+        padded = np.concatenate([b, np.zeros((1, b.shape[1]))])
+        found = np.einsum("nmb,nbk->nmk", self.border, padded[self.columns])
+        if self.numbering.local is not None:
+            found += np.einsum("nmwp,nwpk->nmk", self.local, a[problem_block(self).index2])
+        return np.asarray(found)
+
+    def moved(self, a: Array, b: Array) -> Unknown:
+        """Return the values of the unknowns after a step (R, p), (q,)."""
+        padded = np.append(b, 0.0)
+        tables = []
+        for k, table in enumerate(self.at.tables):
+            step = a if k == self.numbering.local else padded[self.numbering.border[k]]
+            tables.append(table + step)
+        return Unknown(tables, [z + b[n] for z, n in zip(self.at.adjusted, self.numbering.adjusted, strict=True)])
+
+    def _border_prior(self) -> tuple[Array, Array]:
+        """Return the information of the priors of the border, and the distance from their centre, (q,)."""
+        q = self.numbering.size
+        information, offset = np.zeros(q + 1), np.zeros(q + 1)
+        for block, table, n in zip(self.problem.unknowns, self.at.tables, self.numbering.border, strict=True):
+            if n.size:
+                information[n], offset[n] = block.information, table - block.start
+        for z, n in zip(self.at.adjusted, self.numbering.adjusted, strict=True):
+            information[n], offset[n] = 1.0, z
+        return information[:q], offset[:q]
+
+    def prior_square(self) -> float:
+        """Return the sum of squares of the distances from the priors, in units of their standard deviations."""
+        information, offset = self._border_prior()
+        total = float(information @ np.square(offset))
+        if self.numbering.local is not None:
+            block = problem_block(self)
+            total += float(np.sum(block.information * np.square(self.at.tables[self.numbering.local] - block.start)))
+        return total
+
+    def _gauge(self) -> Array | None:
+        if not self.problem.gauge:
+            return None
+        q = self.numbering.size
+        count = len(next(iter(self.problem.gauge.values())))
+        found = np.zeros((q + 1, count))
+        for name, n in zip(self.problem.unknowns._fields, self.numbering.border, strict=True):
+            if n.size and name in self.problem.gauge:
+                found[n] = np.moveaxis(self.problem.gauge[name], 0, -1)
+        return found[:q]
+
+
+def problem_block(linear: Linear) -> Block:
+    """Return the eliminated block."""
+    if linear.numbering.local is None:
+        raise FitError("no block is eliminated")
+    block: Block = linear.problem.unknowns[linear.numbering.local]
+    return block
+
+
+def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None) -> Linear:
+    """Return a problem linearised about values of its unknowns."""
+    number = Numbering.of(problem) if numbering is None else numbering
+    values = [*at.tables, *problem.constant_tables(at)]
+    count, tables = len(problem.unknowns), problem.tables
+    rows = [table.rows(value) for table, value in zip(tables, values, strict=True)]
+    raw = problem.residuals(at)
+    used = np.isfinite(raw)
+    n, m = raw.shape
+    J = _derivatives(problem, tables, values, rows, m)
+    whitener = _whitener(problem, rows, used)
+    r = (whitener @ np.where(used, raw, 0.0)[..., None])[..., 0]
+    parts, numbers = [], []
+    local = np.zeros((n, m, 0, 1))
+    for k, block in enumerate(problem.unknowns):
+        white = np.einsum("nij,njwk->niwk", whitener, J[k])
+        if k == number.local:
+            seen = block.freed[block.index2]  # (n, w, p)
+            local = white * seen[:, None]
+            continue
+        parts.append(white.reshape(n, m, -1))
+        numbers.append(number.border[k][block.index2].reshape(n, -1))
+    for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
+        factor = constant.factor[constant.index2]  # (n, w, width, k)
+        white = np.einsum("nij,njwc,nwcz->niz", whitener, J[count + list(problem.adjusted).index(k)], factor)
+        parts.append(white)
+        numbers.append(np.broadcast_to(its, (n, its.size)))
+    border = np.concatenate(parts, axis=2) if parts else np.zeros((n, m, 0))
+    columns = np.concatenate(numbers, axis=1) if numbers else np.zeros((n, 0), dtype=np.intp)
+    return Linear(problem, at, number, r, used, whitener, local, border, columns)
+
+
+def _derivatives(problem: Problem, tables: list[Table], values: list[Array], rows: list[Array], m: int) -> list[Array]:
+    """Return the derivatives (n, m, w, width) by all unknowns, then by the adjusted constants."""
+    count = len(problem.unknowns)
+    known: dict[int, Array] = {}
+    if problem.derivatives is not None:
+        given = problem.derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
+        for name, J in given.items():
+            k = problem.unknowns._fields.index(name)
+            table = tables[k]
+            whole = J[:, :, None, :] if J.ndim == 3 else J
+            if table.weight is not None:
+                whole = whole * table.weight[:, None, :, None]
+            known[k] = whole
+    wanted = [k for k in range(count) if k not in known] + [count + k for k in problem.adjusted]
+    found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted)
+    by_number = {**known, **dict(zip(wanted, found, strict=True))}
+    return [by_number[k] for k in [*range(count), *(count + k for k in problem.adjusted)]]
+
+
+def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_]) -> Array:
+    """Return the inverse square roots of the covariances of the residuals, (n, m, m); 0 for missing ones.
+
+    With ``L = dr/dy``, which is 1 for a reading minus its prediction, the covariance is that of the reading times L
+    from both sides.
+    """
+    y = column(problem.y)
+    scale = np.broadcast_to(np.asarray(problem.reading_scale, dtype=float), (y.shape[1],))
+    shape = problem.y.shape
+    L = along(lambda moved: problem.evaluate(moved.reshape(shape), rows), y, scale)
+    V = problem.noise.covariance((len(y), y.shape[1]))
+    V = L @ V @ np.swapaxes(L, 1, 2)
+    m = used.shape[1]
+    if m == 1:
+        return np.asarray(np.where(used[..., None], 1.0 / np.sqrt(np.where(used[..., None], V, 1.0)), 0.0))
+    both = used[:, :, None] & used[:, None, :]
+    root = np.linalg.cholesky(np.where(both, V, np.eye(m)))
+    return np.asarray(np.where(used[:, None, :], np.linalg.inv(root), 0.0) * used[:, :, None])
+
+
+def _summed(index: Index, values: Array, size: int) -> Array:
+    """Return the sums of values by index, (size,)."""
+    return np.bincount(index.ravel(), weights=values.ravel(), minlength=size)
+
+
+def _like(named: Any, values: list[Array]) -> Any:
+    """Return values as the named tuple of the same type."""
+    return type(named)(*values) if hasattr(named, "_fields") else tuple(values)

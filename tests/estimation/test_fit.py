@@ -1,0 +1,321 @@
+"""The structured solver against dense solutions, and against closed forms."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation import problem as problems
+from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.problem import Problem
+
+T = TypeVar("T")
+
+
+class Line(NamedTuple, Generic[T]):
+    line: T
+
+
+class Network(NamedTuple, Generic[T]):
+    target: T
+    station: T
+
+
+class Drift(NamedTuple, Generic[T]):
+    knot: T
+    offset: T
+
+
+class Scale(NamedTuple, Generic[T]):
+    scale: T
+
+
+def straight(x: Array, y: Array, **more: Any) -> Problem:
+    def equation(y: Array, u: Line[Array], c: Any) -> Array:
+        return np.asarray(y - u.line[:, 0] - u.line[:, 1] * x)
+
+    block = Block(start=np.zeros((1, 2)), index=np.zeros(x.size, dtype=int), scale=1.0, **more)
+    return Problem(equation=equation, readings=y, unknowns=Line(block), noise=Noise(sd=np.full(x.size, 0.1)))
+
+
+def test_a_straight_line_has_the_closed_form() -> None:
+    x = np.linspace(0, 1, 7)
+    y = 2 + 3 * x + 0.1 * np.random.default_rng(0).standard_normal(7)
+    X = np.stack([np.ones(7), x], axis=1)
+    found = fit(straight(x, y))
+    expected = np.linalg.lstsq(X, y, rcond=None)[0]
+    assert found.unknowns.line[0] == pytest.approx(expected, rel=1e-12)
+    assert found.normal.covariance == pytest.approx(0.01 * np.linalg.inv(X.T @ X), rel=1e-9)
+    assert found.chi2 == pytest.approx(np.sum((y - X @ expected) ** 2) / 0.01)
+    assert found.freedom == 5
+    assert found.leverage[:, 0] == pytest.approx(np.diag(X @ np.linalg.inv(X.T @ X) @ X.T), rel=1e-9)
+
+
+def test_a_missing_reading_is_not_used() -> None:
+    x = np.linspace(0, 1, 7)
+    y = 2 + 3 * x + 0.1 * np.random.default_rng(0).standard_normal(7)
+    y[3] = np.nan
+    one, other = fit(straight(x, y)), fit(straight(np.delete(x, 3), np.delete(y, 3)))
+    assert one.unknowns.line == pytest.approx(other.unknowns.line, rel=1e-12)
+    assert one.normal.covariance == pytest.approx(other.normal.covariance, rel=1e-12)
+    assert one.freedom == other.freedom == 4
+    assert np.isnan(one.residual[3]) and one.leverage[3] == 0
+
+
+def test_a_prior_is_a_reading() -> None:
+    x = np.linspace(0, 1, 7)
+    y = 2 + 3 * x + 0.1 * np.random.default_rng(0).standard_normal(7)
+    found = fit(straight(x, y, prior=np.array([np.inf, 0.05])))
+    X = np.concatenate([np.stack([np.ones(7), x], axis=1) / 0.1, [[0.0, 1 / 0.05]]])
+    right = np.append(y / 0.1, 0.0)
+    expected = np.linalg.lstsq(X, right, rcond=None)[0]
+    assert found.unknowns.line[0] == pytest.approx(expected, rel=1e-11)
+    assert found.chi2 == pytest.approx(np.sum((right - X @ expected) ** 2))
+    assert found.freedom == 6
+    assert found.normal.covariance == pytest.approx(np.linalg.inv(X.T @ X), rel=1e-9)
+
+
+def test_an_undetermined_unknown_is_named() -> None:
+    with pytest.raises(FitError, match="the levels do not determine line 1"):
+        fit(straight(np.full(7, 0.3), np.zeros(7)), what="the levels")
+
+
+def trilateration(targets: int, seed: int = 0, **of_target: Any) -> tuple[Problem, Array, Array]:
+    """Return distances of targets in a plane from four stations, three of which are known."""
+    rng = np.random.default_rng(seed)
+    target, station = rng.uniform(0, 1, (targets, 2)), np.array([[-1, -1], [2, -1], [2, 2], [-1, 2.0]])
+    t, s = (each.ravel() for each in np.meshgrid(np.arange(targets), np.arange(4), indexing="ij"))
+
+    def equation(y: Array, u: Network[Array], c: Any) -> Array:
+        return np.asarray(y - np.linalg.norm(u.target - u.station, axis=1))
+
+    sd = rng.uniform(1e-4, 2e-4, t.size)
+    y = np.linalg.norm(target[t] - station[s], axis=1) + sd * rng.standard_normal(t.size)
+    unknowns = Network(
+        Block(start=target + 0.01, index=t, scale=1.0, **of_target),
+        Block(start=station + [[0, 0], [0, 0], [0, 0], [0.01, -0.02]], index=s, scale=1.0, free=np.arange(4) == 3),
+    )
+    return Problem(equation=equation, readings=y, unknowns=unknowns, noise=Noise(sd=sd)), target, station
+
+
+def dense(problem: Problem) -> tuple[Array, Array]:
+    """Return all free unknowns and their covariance by scipy, from the residuals alone."""
+    free = [block.freed for block in problem.unknowns]
+
+    def tables(v: Array) -> list[Array]:
+        out, at = [], 0
+        for block, f in zip(problem.unknowns, free, strict=True):
+            table = block.start.copy()
+            table[f] = v[at : at + f.sum()]
+            at += f.sum()
+            out.append(table)
+        return out
+
+    def misses(v: Array) -> Array:
+        r = problem.residuals(problems.Unknown(tables(v), []))
+        return np.asarray((r[:, 0] / problem.noise.sd)[np.isfinite(r[:, 0])])
+
+    start = np.concatenate([block.start[f] for block, f in zip(problem.unknowns, free, strict=True)])
+    found = least_squares(misses, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    jacobian = np.asarray(found.jac)
+    return found.x, np.linalg.inv(jacobian.T @ jacobian)
+
+
+@pytest.mark.parametrize("targets", [20, 100])  # all in the border; targets eliminated
+def test_a_network_has_the_dense_solution(targets: int) -> None:
+    problem, _, _ = trilateration(targets)
+    found = fit(problem)
+    x, C = dense(problem)
+    u = np.sqrt(np.diag(C))
+    mine = np.concatenate([found.unknowns.target.ravel(), found.unknowns.station[3]])
+    assert np.abs((mine - x) / u).max() < 1e-5
+    eliminated = found.linear.numbering.local is not None
+    assert eliminated == (targets == 100)
+    q = found.linear.numbering.size
+    if eliminated:
+        whole = found.normal.own + found.normal.shared @ np.swapaxes(found.normal.shared, 1, 2)
+        of_targets = np.array([C[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(targets)])
+        assert np.abs(whole / of_targets - 1).max() < 1e-6
+        assert q == 2
+    assert found.normal.covariance[-2:, -2:] == pytest.approx(C[-2:, -2:], rel=1e-6)
+    # the sum of the leverages is the number of unknowns
+    assert found.leverage.sum() == pytest.approx(2 * targets + 2, rel=1e-9)
+
+
+def test_both_ways_of_elimination_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _, _ = trilateration(30)
+    whole = fit(problem)
+    monkeypatch.setattr(problems, "DENSE", 0)
+    parts = fit(problem)
+    assert parts.linear.numbering.local == 0
+    assert whole.linear.numbering.local is None
+    assert parts.unknowns.target == pytest.approx(whole.unknowns.target, abs=1e-13)
+    assert parts.leverage == pytest.approx(whole.leverage, abs=1e-9)
+    assert parts.normal.covariance == pytest.approx(whole.normal.covariance[-2:, -2:], rel=1e-8)
+
+
+def test_a_free_network_has_a_gauge() -> None:
+    """A free network of stations and targets: distances do not see motions of the whole."""
+    problem, _, station = trilateration(100)
+    unknowns = problem.unknowns._replace(station=Block(start=station, index=problem.unknowns[1].index, scale=1.0))
+    turned = np.stack([-station[:, 1], station[:, 0]], axis=1)
+    gauge = {"station": np.stack([np.tile([1.0, 0], (4, 1)), np.tile([0, 1.0], (4, 1)), turned])}
+    free = Problem(
+        equation=problem.equation, readings=problem.readings, unknowns=unknowns, noise=problem.noise, gauge=gauge
+    )
+    with pytest.raises(FitError, match="station 1, 2, 3, 4"):
+        fit(Problem(equation=problem.equation, readings=problem.readings, unknowns=unknowns, noise=problem.noise))
+    found = fit(free)
+    assert found.freedom == 400 - 208 + 3
+    # distances between the stations do not depend on the gauge: the minimum is that of three fixed coordinates
+    fixed = np.zeros((4, 2), dtype=bool)
+    fixed[0], fixed[1, 1] = True, True
+    held = Block(start=station, index=problem.unknowns[1].index, scale=1.0, free=~fixed)
+    other = fit(
+        Problem(
+            equation=problem.equation, readings=problem.readings, unknowns=unknowns._replace(station=held),
+            noise=problem.noise,
+        )
+    )  # fmt: skip
+    apart = [np.linalg.norm(each.unknowns.station[2] - each.unknowns.station[0]) for each in (found, other)]
+    assert apart[0] == pytest.approx(apart[1], rel=1e-12)
+    assert found.chi2 == pytest.approx(other.chi2, rel=1e-9)
+    # and so are their variances
+    away = found.unknowns.station[2] - found.unknowns.station[0]
+    along = np.zeros((4, 2))
+    along[2], along[0] = away / np.linalg.norm(away), -away / np.linalg.norm(away)
+    free_u = along.ravel() @ found.normal.covariance @ along.ravel()
+    held_u = along[~fixed] @ other.normal.covariance @ along[~fixed]
+    assert free_u == pytest.approx(held_u, rel=1e-5)
+
+
+def drifting(knots: int, seed: int = 0) -> Problem:
+    """Return readings of a drift between knots (a parabola through three) plus an offset of each of 5 channels."""
+    rng = np.random.default_rng(seed)
+    time = np.sort(rng.uniform(0, knots - 1, 40 * knots))
+    nearest = np.clip(np.rint(time).astype(int), 1, knots - 2)
+    w = time - nearest
+    weight = np.stack([w * (w - 1) / 2, 1 - w**2, w * (w + 1) / 2], axis=1)
+    index = nearest[:, None] + np.array([-1, 0, 1])
+    channel = rng.integers(0, 5, time.size)
+    lever = rng.uniform(0.5, 1.5, time.size)
+
+    def equation(y: Array, u: Drift[Array], c: Any) -> Array:
+        return np.asarray(y - u.knot[:, 0] - lever * np.sin(u.knot[:, 1]) - u.offset[:, 0])
+
+    y = np.cumsum(rng.standard_normal(knots))[nearest] / 10 + 0.05 * rng.standard_normal(time.size)
+    free = np.arange(knots) > 0
+    unknowns = Drift(
+        Block(start=np.zeros((knots, 2)), index=index, weight=weight, scale=1.0, free=free),
+        Block(start=np.zeros((5, 1)), index=channel, scale=1.0),
+    )
+    return Problem(equation=equation, readings=y, unknowns=unknowns, noise=Noise(sd=np.full(time.size, 0.05)))
+
+
+@pytest.mark.parametrize("knots", [8, 9])
+def test_a_chain_has_the_dense_solution(knots: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = drifting(knots)
+    whole = fit(problem)
+    monkeypatch.setattr(problems, "DENSE", 0)
+    parts = fit(problem)
+    assert parts.linear.numbering.band == 2
+    assert parts.unknowns.knot == pytest.approx(whole.unknowns.knot, abs=1e-9)
+    assert parts.leverage == pytest.approx(whole.leverage, abs=1e-9)
+    assert parts.leverage.sum() == pytest.approx(2 * (knots - 1) + 5, rel=1e-9)
+    C = whole.normal.covariance
+    own = parts.normal.own + parts.normal.shared @ np.swapaxes(parts.normal.shared, 1, 2)
+    for k in range(1, knots):
+        at = slice(2 * (k - 1), 2 * k)
+        assert own[k] == pytest.approx(C[at, at], rel=1e-7)
+    assert parts.normal.covariance == pytest.approx(C[-5:, -5:], rel=1e-7)
+    pair = parts.normal.local_covariance(np.array([3]), np.array([5]))[0]
+    pair = pair + parts.normal.shared[3] @ parts.normal.shared[5].T
+    assert pair == pytest.approx(C[4:6, 8:10], rel=1e-6, abs=1e-12)
+
+
+def test_a_vector_reading_with_correlated_noise_has_the_generalised_solution() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((6, 4, 4)) * 0.1 + 0.2 * np.eye(4)
+    X = rng.standard_normal((6, 4, 2))
+    y = X @ [1.0, -2.0] + np.einsum("nij,nj->ni", root, rng.standard_normal((6, 4)))
+    y[2, 1] = np.nan
+
+    def equation(y: Array, u: Line[Array], c: Any) -> Array:
+        return np.asarray(y - np.einsum("nij,nj->ni", X, u.line))
+
+    block = Block(start=np.zeros((1, 2)), index=np.zeros(6, dtype=int), scale=1.0)
+    found = fit(Problem(equation=equation, readings=y, unknowns=Line(block), noise=Noise(root=root)))
+    known = np.isfinite(y).ravel()
+    V = np.zeros((24, 24))
+    for k in range(6):
+        V[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] = root[k] @ root[k].T
+    V, A, b = V[np.ix_(known, known)], X.reshape(24, 2)[known], y.ravel()[known]
+    C = np.linalg.inv(A.T @ np.linalg.solve(V, A))
+    assert found.unknowns.line[0] == pytest.approx(C @ A.T @ np.linalg.solve(V, b), rel=1e-10)
+    assert found.normal.covariance == pytest.approx(C, rel=1e-8)
+    assert found.freedom == 21
+
+
+def test_the_noise_of_a_condition_is_that_of_its_readings() -> None:
+    """A circle through points: the residual is a distance, the noise that of the coordinates along it."""
+    rng = np.random.default_rng(4)
+    angle = np.linspace(0, 2, 30)
+    points = np.stack([np.cos(angle), np.sin(angle)], axis=1) * 0.02
+    sd = np.broadcast_to(np.array([1e-6, 3e-6]), points.shape)
+    y = points + sd * rng.standard_normal(points.shape)
+
+    def equation(y: Array, u: Line[Array], c: Any) -> Array:
+        return np.asarray(np.linalg.norm(y - u.line[:, :2], axis=1) - u.line[:, 2])
+
+    block = Block(start=np.array([[0.0, 0, 0.02]]), index=np.zeros(30, dtype=int), scale=0.02)
+    found = fit(
+        Problem(equation=equation, readings=y, unknowns=Line(block), noise=Noise(sd=sd), reading_scale=0.02)
+    )  # fmt: skip
+    c, s = np.cos(angle), np.sin(angle)
+    J = np.stack([c, s, np.ones_like(c)], axis=1)
+    w = 1 / ((c * 1e-6) ** 2 + (s * 3e-6) ** 2)
+    assert found.normal.covariance == pytest.approx(np.linalg.inv((J.T * w) @ J), rel=1e-3)
+
+
+def test_an_adjusted_constant_is_an_unknown_with_its_prior() -> None:
+    x = np.linspace(1, 2, 9)
+    y = 5.0 * 1.002 * x + 1e-3 * np.random.default_rng(1).standard_normal(9)
+
+    def equation(y: Array, u: Line[Array], c: Scale[Array]) -> Array:
+        return np.asarray(y - u.line[:, 0] - 5.0 * c.scale[:, 0] * x)
+
+    zero = np.zeros(9, dtype=int)
+
+    def made(adjust: bool) -> Fit:
+        scale = Constant(value=np.ones((1, 1)), factor=np.full((1, 1, 1), 1e-3), index=zero, scale=1.0, adjust=adjust)
+        block = Block(start=np.zeros((1, 1)), index=zero, scale=1.0)
+        return fit(
+            Problem(
+                equation=equation, readings=y, unknowns=Line(block), constants=Scale(scale),
+                noise=Noise(sd=np.full(9, 1e-3)),
+            )
+        )  # fmt: skip
+
+    found = made(True)
+    A = np.concatenate([np.stack([np.ones(9), 5e-3 * x], axis=1) / 1e-3, [[0, 1]]])
+    expected = np.linalg.lstsq(A, np.append((y - 5 * x) / 1e-3, 0), rcond=None)[0]
+    assert found.unknowns.line[0, 0] == pytest.approx(expected[0], rel=1e-9)
+    assert found.constants.scale[0, 0] == pytest.approx(1 + 1e-3 * expected[1], rel=1e-12)
+    assert found.normal.covariance == pytest.approx(np.linalg.inv(A.T @ A), rel=1e-8)
+    assert made(False).constants.scale[0, 0] == 1.0
+
+
+def test_exact_readings_converge() -> None:
+    x = np.linspace(0, 1, 7)
+    problem = straight(x, 2 + 3 * x)
+    loose = Problem(
+        equation=problem.equation, readings=problem.readings, unknowns=problem.unknowns,
+        noise=Noise(sd=np.ones(7), stated=False),
+    )  # fmt: skip
+    assert fit(loose).unknowns.line[0] == pytest.approx([2, 3], abs=1e-14)
