@@ -350,7 +350,7 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
     raw = problem.residuals(at)
     used = np.isfinite(raw)
     n, m = raw.shape
-    J = _derivatives(problem, tables, values, rows, m)
+    J = _derivatives(problem, tables, values, rows)
     whitener = _whitener(problem, rows, used)
     r = (whitener @ np.where(used, raw, 0.0)[..., None])[..., 0]
     parts, numbers = [], []
@@ -373,7 +373,7 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
     return Linear(problem, at, number, r, used, whitener, local, border, columns)
 
 
-def _derivatives(problem: Problem, tables: list[Table], values: list[Array], rows: list[Array], m: int) -> list[Array]:
+def _derivatives(problem: Problem, tables: list[Table], values: list[Array], rows: list[Array]) -> list[Array]:
     """Return the derivatives (n, m, w, width) by all unknowns, then by the adjusted constants."""
     count = len(problem.unknowns)
     known: dict[int, Array] = {}
@@ -414,7 +414,7 @@ def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_]) -> A
 
 def _summed(index: Index, values: Array, size: int) -> Array:
     """Return the sums of values by index, (size,)."""
-    return np.bincount(index.ravel(), weights=values.ravel(), minlength=size)
+    return np.asarray(np.bincount(index.ravel(), weights=values.ravel(), minlength=size), dtype=float)
 
 
 def _like(named: Any, values: list[Array]) -> Any:

@@ -65,7 +65,8 @@ def test_a_missing_reading_is_not_used() -> None:
     assert one.unknowns.line == pytest.approx(other.unknowns.line, rel=1e-12)
     assert one.normal.covariance == pytest.approx(other.normal.covariance, rel=1e-12)
     assert one.freedom == other.freedom == 4
-    assert np.isnan(one.residual[3]) and one.leverage[3] == 0
+    assert np.isnan(one.residual[3])
+    assert one.leverage[3] == 0
 
 
 def test_a_prior_is_a_reading() -> None:
@@ -99,7 +100,12 @@ def trilateration(targets: int, seed: int = 0, **of_target: Any) -> tuple[Proble
     y = np.linalg.norm(target[t] - station[s], axis=1) + sd * rng.standard_normal(t.size)
     unknowns = Network(
         Block(start=target + 0.01, index=t, scale=1.0, **of_target),
-        Block(start=station + [[0, 0], [0, 0], [0, 0], [0.01, -0.02]], index=s, scale=1.0, free=np.arange(4) == 3),
+        Block(
+            start=station + np.array([[0, 0], [0, 0], [0, 0], [0.01, -0.02]]),
+            index=s,
+            scale=1.0,
+            free=np.arange(4) == 3,
+        ),
     )
     return Problem(equation=equation, readings=y, unknowns=unknowns, noise=Noise(sd=sd)), target, station
 
@@ -119,7 +125,7 @@ def dense(problem: Problem) -> tuple[Array, Array]:
 
     def misses(v: Array) -> Array:
         r = problem.residuals(problems.Unknown(tables(v), []))
-        return np.asarray((r[:, 0] / problem.noise.sd)[np.isfinite(r[:, 0])])
+        return np.asarray((r[:, 0] / np.asarray(problem.noise.sd))[np.isfinite(r[:, 0])])
 
     start = np.concatenate([block.start[f] for block, f in zip(problem.unknowns, free, strict=True)])
     found = least_squares(misses, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
