@@ -10,6 +10,7 @@ from short_demonstration import measure
 
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration
+from errormotion.report.document import estimate
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,16 @@ def test_the_demo_prints_results_and_true_values(run: Callable[..., Result], tmp
     assert abs(step["measured"] - step["truth"]) < 2 * step["expanded_uncertainty"]
     found_beams = numbers["beam detection: directions off by (rms)"]["measured"]
     assert found_beams < numbers["nominal beams: directions off by (rms)"]["measured"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_campaign")
+def test_the_table_and_the_report_state_the_same_step(run: Callable[..., Result], tmp_path: Path) -> None:
+    found = json.loads(run("demo", "--json").stdout)
+    [report] = [tmp_path / test["report"] for test in found["tests"] if "-drift-" in test["report"]]
+    [step] = [number for number in found["numbers"] if number["name"].startswith("EZ step")]
+    stated = estimate(step["measured"], step["expanded_uncertainty"])
+    assert f"Z at the functional point stepped by {stated.text} ± {stated.uncertainty} µm" in report.read_text()
 
 
 @pytest.mark.usefixtures("short_campaign")

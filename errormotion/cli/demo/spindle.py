@@ -21,7 +21,9 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.compare import compare as compared
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import move
-from errormotion.report.drawings.series import step_weights
+from errormotion.report.document import Source
+from errormotion.report.drawings.series import events, steps
+from errormotion.report.provenance import read
 from errormotion.twin import VirtualMachine
 
 CAMPAIGN = Path(__file__).parent / "campaign.toml"
@@ -92,45 +94,31 @@ def agree(drift: RunFolder, balls: RunFolder) -> xr.Dataset:
 
 
 def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, clock: float, settings: Any) -> list[Number]:
-    t = np.asarray(errors["time"].values) + float(errors.attrs["reference_time"])
-    truth = _truth(machine, errors, clock, errors.attrs["functional_point"])
+    zero = float(errors.attrs["reference_time"])
+    t = np.asarray(errors["time"].values)
+    point = errors.attrs["functional_point"]
     off = [e for e in settings.schedule if e.compensation]
     half = settings.average / 2  # the time of a mean is its middle
-    end = int(np.searchsorted(t, off[0].at - half, side="right")) - 1
+    end = int(np.searchsorted(t, off[0].at - zero - half, side="right")) - 1
+    [truth] = _truth(machine, errors, clock, t[[end]], point)
     numbers = []
-    for k, (name, scale) in enumerate([("EX", UM), ("EY", UM), ("EZ", UM), ("EA", ARCSEC), ("EB", ARCSEC)]):
-        weights = np.zeros(t.size)
-        weights[end] = 1.0
-        what = f"{name} after {t[end] / 60:.0f} min, compensation on"
-        numbers.append(_number(what, errors, truth, weights, k, scale))
-    for event in off:
-        axis = next(iter(event.compensation))
-        found = step_weights(errors, f"E{axis}", event.at - float(errors.attrs["reference_time"]))
-        if found is not None:
+    for k, (name, (factor, unit)) in enumerate([("EX", UM), ("EY", UM), ("EZ", UM), ("EA", ARCSEC), ("EB", ARCSEC)]):
+        value = float(errors[name].values[end])
+        expanded = 2.0 * float(np.sqrt(errors["covariance"].values[end, k, k]))
+        what = f"{name} after {(t[end] + zero) / 60:.0f} min, compensation on"
+        numbers.append(Number(what, value * factor, expanded * factor, float(truth[k]) * factor, unit))
+    for event, axis, step in steps(errors, events(Source(errors, provenance=read(errors)))):
+        if step is not None:
             what = f"E{axis} step, compensation of {axis} switched off"
-            numbers.append(_number(what, errors, truth, found.step, "XYZ".index(axis), UM))
+            [corrected] = machine.state.correction_at([clock + zero + 60 * event.minute])
+            true_step = float(corrected["XYZ".index(axis)])
+            numbers.append(Number(what, *(1e6 * each for each in (step.step, 2 * step.u_step, true_step)), "um"))
     return numbers
-
-
-def _number(
-    name: str, errors: xr.Dataset, truth: Array, weights: Array, freedom: int, scale: tuple[float, str]
-) -> Number:
-    value, covariance = errors.em.combine(weights, "time")
-    factor, unit = scale
-    expanded = 2.0 * float(np.sqrt(covariance.values[freedom, freedom]))
-    return Number(
-        name,
-        float(value.values[freedom]) * factor,
-        expanded * factor,
-        float(weights @ truth[:, freedom]) * factor,
-        unit,
-    )
 
 
 def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[Number]:
     """Return the ISO 230-3 ranges of the first hour: displacements at the two levels, Z and the tilts."""
-    t = np.asarray(errors["time"].values)
-    hour = (t >= 0.0) & (t <= 3600.0)
+    hour = np.arange(3601.0)
     numbers = []
     low, high = np.asarray(errors["level_height"].values, dtype=float)
     quantities = {
@@ -143,7 +131,7 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[N
         "B": (0.0, 4),
     }
     for name, (height, freedom) in quantities.items():
-        truth = _truth(machine, errors, clock, (0.0, 0.0, height))[hour, freedom]
+        truth = _truth(machine, errors, clock, hour, (0.0, 0.0, height))[:, freedom]
         factor, unit = ARCSEC if freedom > 2 else UM
         measured = errors["iso_value"].sel(quantity=name, measure="range_60min").item()
         u = errors["iso_uncertainty"].sel(quantity=name, measure="range_60min").item()
@@ -152,10 +140,10 @@ def _ranges(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> list[N
     return numbers
 
 
-def _truth(machine: VirtualMachine, errors: xr.Dataset, clock: float, point: Any) -> Array:
-    """Return the true twists (time, 6) at the times of a result, relative to its reference state."""
+def _truth(machine: VirtualMachine, errors: xr.Dataset, clock: float, time: Array, point: Any) -> Array:
+    """Return the true twists (time, 6) at times of a result, relative to its reference state."""
     reference = clock + float(errors.attrs["reference_time"])
-    t = np.asarray(errors["time"].values) + reference
+    t = time + reference
     shift = np.asarray(point, dtype=float) - machine.spindle_functional_point
     twists = machine.spindle_twist(t) - machine.spindle_twist(np.array([reference]))
     return np.asarray(move(twists, shift))

@@ -128,21 +128,67 @@ class StepWeights:
     Attributes
     ----------
     before, step : ndarray
-        Mean before the step, and mean after it minus mean before it.
-    drift : ndarray
-        Part of the difference of the means that is the drift between them, by lines on both sides.
+        Value at the step by the line before it, and that by the line after it minus that by the line before it.
+    bent_before, bent_after : ndarray
+        Effects on the values by the lines of a curvature that changes a slope by itself within the age of the drift.
     """
 
     before: np.ndarray
     step: np.ndarray
-    drift: np.ndarray
+    bent_before: np.ndarray
+    bent_after: np.ndarray
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a displacement and its value before the step, with standard uncertainties, m."""
+
+    before: float
+    u_before: float
+    step: float
+    u_step: float
+
+
+def steps(errors: xr.Dataset, done: Sequence[Event]) -> list[tuple[Event, str, Step | None]]:
+    """Return each switched compensation with its axis and the step of the displacement; None where it is unknown."""
+    found = []
+    for event in done:
+        for axis in event.axes:
+            others = [60 * other.minute for other in done if axis in other.axes or not other.axes]
+            found.append((event, axis, step_of(errors, f"E{axis}", 60 * event.minute, others)))
+    return found
+
+
+def step_of(errors: xr.Dataset, freedom: str, at: float, others: Sequence[float] = ()) -> Step | None:
+    """Return the step of a freedom over ``time`` by `step_weights`; None as there."""
+    weights = step_weights(errors, freedom, at, others)
+    if weights is None:
+        return None
+    (before, u_before), (step, u_step), (bent_before, _), (bent_after, _) = (
+        _combined(errors, each, freedom)
+        for each in (weights.before, weights.step, weights.bent_before, weights.bent_after)
+    )
+    bent = abs(bent_before) + abs(bent_after)
+    return Step(before, math.hypot(u_before, bent_before), step, math.hypot(u_step, bent))
+
+
+def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> tuple[float, float]:
+    """Return a linear combination of one displacement over time with its standard uncertainty, m."""
+    used = np.flatnonzero(weights)
+    combined = errors.isel(time=used).em.combine(weights[used], "time")
+    variance = float(combined.covariance.sel(dof=freedom, dof_=freedom))
+    return float(combined.value.sel(dof=freedom)), math.sqrt(max(variance, 0.0))
 
 
 def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[float] = ()) -> StepWeights | None:
-    """Return the weights of a step of a freedom over ``time``, by means over `AROUND_A_STEP` before and after it.
+    """Return the weights of a step of a freedom over ``time``, by lines through the values before and after it.
 
-    Values whose mean contains a time from ``at`` until `SWITCHING` later are on neither side. Where no value is within
-    `AROUND_A_STEP`, the nearest one is used. None where one side has no value, or where the drift is unknown.
+    A line is fitted to the values within `AROUND_A_STEP`, or to the two nearest ones if it contains fewer. Values whose
+    mean contains a time from ``at`` until `SWITCHING` later are on neither side. None where one side has fewer than two
+    values: a switched compensation changes the slope, so that the line of the other side does not replace it.
+
+    A drift that has lasted for a time t, its age, is bent by no more than its slope divided by t: faster parts of a
+    warm-up are over by then.
 
     Parameters
     ----------
@@ -150,7 +196,7 @@ def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[f
         Over ``time``.
     freedom : str
     at : float
-        Time of the step, s.
+        Time of the step, s since the reference state.
     others : sequence of float
         Times of other changes, s, beyond which no value is used.
     """
@@ -158,8 +204,8 @@ def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[f
     known = np.isfinite(errors[freedom].values)
     length, mean = length_of_means(errors)
     reach = length / 2 if mean else length  # a time stamp may be that of the start or of the end of a reading
-    means, distances = list[np.ndarray](), list[float]()
-    slopes = list[np.ndarray | None]()
+    age = at - max((other for other in others if other < at), default=0.0)
+    values, bent = list[np.ndarray](), list[np.ndarray]()
     for later in (False, True):
         usable = known & ((time - reach >= at + SWITCHING - 1e-6) if later else (time + reach <= at + 1e-6))
         for other in others:
@@ -169,21 +215,15 @@ def step_weights(errors: xr.Dataset, freedom: str, at: float, others: Sequence[f
                 usable &= time - reach >= other + SWITCHING - 1e-6
         nearest = np.flatnonzero(usable)
         nearest = nearest[np.argsort(np.abs(time[nearest] - at), kind="stable")]
-        if not nearest.size:
+        if nearest.size < 2:
             return None
-        near = nearest[: max(1, int((np.abs(time[nearest] - at) <= AROUND_A_STEP).sum()))]
-        means.append(_spread(time.size, near, np.full(near.size, 1.0 / near.size)))
-        distances.append(float(time[near].mean()) - at)
-        if nearest.size > 1:
-            line = nearest[: max(2, near.size)]
-            centred = time[line] - time[line].mean()
-            slopes.append(_spread(time.size, line, centred / (centred @ centred)))
-        else:
-            slopes.append(None)
-    first, second = (each if each is not None else other for each, other in (slopes, slopes[::-1]))
-    if first is None or second is None:
-        return None
-    return StepWeights(means[0], means[1] - means[0], distances[1] * second - distances[0] * first)
+        line = nearest[: max(2, int((np.abs(time[nearest] - at) <= AROUND_A_STEP).sum()))]
+        t = time[line] - at
+        slope = (t - t.mean()) / np.sum((t - t.mean()) ** 2)
+        value = 1.0 / t.size - t.mean() * slope
+        values.append(_spread(time.size, line, value))
+        bent.append(_spread(time.size, line, slope * (value @ t**2) / 2 / max(age, AROUND_A_STEP)))
+    return StepWeights(values[0], values[1] - values[0], *bent)
 
 
 def _spread(size: int, places: np.ndarray, weights: np.ndarray) -> np.ndarray:

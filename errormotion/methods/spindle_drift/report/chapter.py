@@ -23,7 +23,7 @@ from errormotion.report.drawings.series import (
     events,
     last_known,
     minutes_of,
-    step_weights,
+    steps,
     unit_of,
 )
 from errormotion.report.text import UM, finite, fixed, integer, listed, minutes
@@ -137,38 +137,23 @@ def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
 
 
 def _changes(errors: xr.Dataset, done: Sequence[Event]) -> list[str]:
-    """Return the effect of each switched compensation: the step of the displacement at the functional point.
-
-    The warm-up goes on between the means before and after it. Half of this drift is a standard uncertainty of the step.
-    """
+    """Return the effect of each switched compensation: the step of the displacement at the functional point."""
     words = []
-    for event in done:
-        for axis in event.axes:
-            freedom = f"E{axis}"
-            others = [60 * other.minute for other in done if axis in other.axes or not other.axes]
-            head = f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min"
-            weights = step_weights(errors, freedom, 60 * event.minute, others)
-            if weights is None:
-                words.append(f"{head}: the step of {axis} is unknown: too few means before or after it are complete.")
-                continue
-            drift, _ = _combined(errors, weights.drift, freedom)
-            before, u_before = _combined(errors, weights.before, freedom)
-            step, u_step = _combined(errors, weights.step, freedom)
-            start = estimate(before / UM[1], 2 * u_before / UM[1])
-            change = estimate(step / UM[1], 2 * math.hypot(u_step, drift / 2) / UM[1])
+    for event, axis, step in steps(errors, done):
+        head = f"{event.what[0].upper()}{event.what[1:]} at {fixed(event.minute, 1)} min"
+        if step is None:
             words.append(
-                f"{head}: {axis} at the functional point stepped by {_with_uncertainty(change)} µm, from "
-                f"{_with_uncertainty(start)} µm."
+                f"{head}: the step of {axis} is unknown: fewer than two means before or after it are complete. "
+                "A smaller 'average' gives more of them."
             )
+            continue
+        start = estimate(step.before / UM[1], 2 * step.u_before / UM[1])
+        change = estimate(step.step / UM[1], 2 * step.u_step / UM[1])
+        words.append(
+            f"{head}: {axis} at the functional point stepped by {_with_uncertainty(change)} µm, from "
+            f"{_with_uncertainty(start)} µm."
+        )
     return words
-
-
-def _combined(errors: xr.Dataset, weights: np.ndarray, freedom: str) -> tuple[float, float]:
-    """Return a linear combination of one displacement over time with its standard uncertainty, m."""
-    used = np.flatnonzero(weights)
-    combined = errors.isel(time=used).em.combine(weights[used], "time")
-    variance = float(combined.covariance.sel(dof=freedom, dof_=freedom))
-    return float(combined.value.sel(dof=freedom)), math.sqrt(max(variance, 0.0))
 
 
 def _first_hour(errors: xr.Dataset) -> list[str]:
