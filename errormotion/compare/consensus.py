@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from errormotion.arrays import Array, filled
-from errormotion.compare.normal import Information, Reduced, Solution, short, solve
+from errormotion.arrays import Array
 from errormotion.compare.pairs import ChiSquare
 from errormotion.compare.stack import Estimate
+from errormotion.estimation.between_runs import variance_between
+from errormotion.estimation.information import Information, Reduced, Solution, short, solve
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,7 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
 
     Values that are exactly zero by definition (a reference state) are not used; they are zero in the result.
     """
-    keys = {key: k for k, key in enumerate(dict.fromkeys(key for each in estimates for key in each.source))}
-    parts = [Information.of(each, keys) for each in estimates]
+    keys, parts = information(estimates)
     known = np.array([each.known for each in parts])
     count = known.sum(axis=0)
     degrees = int((count - (count > 0)).sum())
@@ -63,12 +63,20 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
     else:
         reduced = Reduced.of(parts, len(keys))
         found = reduced.solution()
-        left = np.maximum(found.square - reduced.falls(), 0.0).tolist()
+        left = np.maximum(found.square - reduced.decreases(), 0.0).tolist()
     fit = ChiSquare(max(found.square, 0.0), degrees)
     rest = [ChiSquare(square, its) for square, its in zip(left, left_degrees, strict=True)]
     without = [ChiSquare(max(fit.value - each.value, 0.0), degrees - each.degrees) for each in rest]
     estimate = _estimate(found, estimates)
     return Consensus(estimate, fit, without, _holm([each.p for each in without]), rest)
+
+
+def information(estimates: Sequence[Estimate]) -> tuple[dict[str, int], list[Information]]:
+    """Return the number of each source by its key, and the information of each estimate."""
+    keys = {key: k for k, key in enumerate(dict.fromkeys(key for each in estimates for key in each.source))}
+    columns = [np.array([keys[key] for key in each.source], dtype=np.intp) for each in estimates]
+    parts = [Information.of(e.value, e.own, e.influence, c) for e, c in zip(estimates, columns, strict=True)]
+    return keys, parts
 
 
 def _estimate(found: Solution, estimates: Sequence[Estimate]) -> Estimate:
@@ -96,31 +104,8 @@ def _holm(p: Sequence[float]) -> list[float]:
 
 
 def random_effects(estimates: Sequence[Estimate]) -> tuple[Array, Array, Array]:
-    """Return a robust mean with a variance between datasets (DerSimonian and Laird 1986).
+    """Return a robust mean and its standard uncertainty, (n, d), and the standard deviation between datasets, (d,).
 
     The variance between datasets is estimated for each freedom from all points together.
-
-    Returns
-    -------
-    value, standard_uncertainty : ndarray, (n, d)
-    tau : ndarray, (d,)
-        Standard deviation between datasets, m and rad.
     """
-    y = np.array([each.value for each in estimates])
-    variance = np.array([each.variance() for each in estimates])
-    known = np.isfinite(y) & (variance > 0)
-    w = np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
-    total = w.sum(axis=0)
-    y = filled(y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = (w * y).sum(axis=0) / total
-    Q = np.nansum((w * (y - filled(mean)) ** 2), axis=0)
-    degrees = np.maximum(known.sum(axis=0) - 1, 0)
-    c = np.where(total > 0, total - (w**2).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
-    weight = c.sum(axis=0)
-    tau2 = np.maximum((Q - degrees).sum(axis=0), 0.0) / np.where(weight > 0, weight, np.inf)
-    w = np.where(known, 1.0 / np.where(known, variance + tau2, 1.0), 0.0)
-    total = w.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        value, u = (w * y).sum(axis=0) / total, np.sqrt(1.0 / total)
-    return np.where(total > 0, value, np.nan), np.where(total > 0, u, np.nan), np.sqrt(tau2)
+    return variance_between(np.array([each.value for each in estimates]), np.array([e.variance() for e in estimates]))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.record.regression import by_moving_ranges, difference_variance
+from errormotion.estimation.between_runs import by_moving_ranges, difference_variance
 from errormotion.record.series import Series
 from errormotion.record.steps import Model
 

@@ -16,9 +16,9 @@ import xarray as xr
 
 from errormotion.datasets.files.events import instant
 from errormotion.errors import DatasetError, RunError
+from errormotion.estimation.between_runs import COVERAGE
 from errormotion.record.control import chart
 from errormotion.record.figures import figure_over_time
-from errormotion.record.regression import COVERAGE
 from errormotion.record.runs.listing import Listing, Note
 from errormotion.record.series import Series
 from errormotion.record.steps import FALSE_DEPARTURES, FALSE_STEPS, Model, Step, model_of

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from errormotion.arrays import Array
-from errormotion.record.regression import Fit, by_moving_ranges, difference_variance, fit
+from errormotion.estimation.between_runs import RunFit, by_moving_ranges, difference_variance, fit_runs
 from errormotion.record.series import Series
 
 FALSE_STEPS = 0.035
@@ -78,7 +78,7 @@ class Model:
 
     Attributes
     ----------
-    fit : Fit or None
+    fit : RunFit or None
         The first two parameters are the value at the first run and the trend per year; None for too few values.
     steps : tuple of Step
         Steps in chronological order.
@@ -88,7 +88,7 @@ class Model:
         Change per year, with the limits of its interval.
     """
 
-    fit: Fit | None
+    fit: RunFit | None
     steps: tuple[Step, ...] = ()
     departing: tuple[int, ...] = ()
     trend: tuple[float, float, float] = (np.nan, np.nan, np.nan)
@@ -101,7 +101,7 @@ def model_of(series: Series) -> Model:
         return Model(None)
     found = _search(series, base)
     X = _design(base, found)
-    result = fit(X, series.value, series.covariance)
+    result = fit_runs(X, series.value, series.covariance)
     if result is None:
         return Model(None)
     V = series.covariance + result.tau**2 * np.eye(series.size)
@@ -118,11 +118,11 @@ def model_of(series: Series) -> Model:
     return Model(result, tuple(sorted(steps, key=lambda step: step.index)), tuple(sorted(departing)), trend)
 
 
-def _trend(series: Series, base: Array, found: list[Candidate], result: Fit) -> tuple[float, float, float]:
+def _trend(series: Series, base: Array, found: list[Candidate], result: RunFit) -> tuple[float, float, float]:
     """Return the trend with its interval, which covers that of the model without uncertain candidates."""
     fits = [result]
     certain = [each for each in found if each.p <= CERTAIN]
-    if len(certain) < len(found) and (without := fit(_design(base, certain), series.value, series.covariance)):
+    if len(certain) < len(found) and (without := fit_runs(_design(base, certain), series.value, series.covariance)):
         fits.append(without)
     low = min(float(each.parameters[1] - each.half_width[1]) for each in fits)
     high = max(float(each.parameters[1] + each.half_width[1]) for each in fits)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from errormotion.compare.consensus import consensus, random_effects
-from errormotion.compare.normal import Information, Reduced, short, solve
+from errormotion.compare.consensus import consensus
 from errormotion.compare.pairs import pair
 from errormotion.compare.stack import Estimate, gathered
-from errormotion.estimation.low_rank import whitener
 
 N, D = 9, 4
 SCALE = np.array([1e-6, 2e-6, 5e-6, 1e-5])
@@ -43,26 +41,6 @@ def dense(models):
             at = slice(i * N * D + k * D, i * N * D + (k + 1) * D)
             V[at, at] += each.own[k]
     return V
-
-
-def test_whitening_is_the_inverse_of_the_dense_covariance():
-    rng = np.random.default_rng(1)
-    one = model(rng, "a")
-    a, b = rng.normal(size=(2, 3, N, D)) * SCALE
-    white = whitener(one.own, one.influence)
-    V = dense([one])
-    expected = a.reshape(3, -1) @ np.linalg.solve(V, b.reshape(3, -1).T)
-    np.testing.assert_allclose(white.product(a, b), expected, rtol=1e-8)
-    assert white.degrees == N * D
-
-
-def test_a_value_that_is_exactly_zero_is_no_evidence():
-    rng = np.random.default_rng(2)
-    one = model(rng, "a")
-    own, F = one.own.copy(), one.influence.copy()
-    own[0], F[:, 0] = 0.0, 0.0
-    own[3, 2], own[3, :, 2], F[:, 3, 2] = np.nan, np.nan, np.nan
-    assert whitener(own, F).degrees == N * D - D - 1
 
 
 @pytest.mark.parametrize("shared", [(), ("bar", "thermometer")])
@@ -136,20 +114,6 @@ def test_an_incompatible_dataset_is_named():
     assert named >= 38
 
 
-def test_the_robust_mean_estimates_the_spread_between_datasets():
-    rng = np.random.default_rng(7)
-    models = [model(rng, f"m{k}", sources=0) for k in range(12)]
-    tau = 20 * SCALE
-    found = []
-    for _ in range(30):
-        values = drawn(rng, models, np.zeros((N, D)))
-        for each in values:
-            each.value[:] += rng.normal(size=(N, D)) * tau
-        found.append(random_effects(values)[2])
-    np.testing.assert_allclose(np.mean(found, axis=0), tau, rtol=0.1)
-    assert (random_effects(drawn(rng, models, np.zeros((N, D))))[2] < 2 * SCALE).all()
-
-
 def test_unknown_values_of_one_dataset_do_not_affect_the_others():
     rng = np.random.default_rng(8)
     values = drawn(rng, [model(rng, name) for name in "abc"], np.zeros((N, D)))
@@ -159,27 +123,6 @@ def test_unknown_values_of_one_dataset_do_not_affect_the_others():
     assert found.fit.degrees == 2 * N * D - D
     assert np.isnan(pair(values[0], values[1]).en[2]).all()
     assert pair(values[0], values[1]).joint.degrees == N * D - D
-
-
-def test_datasets_that_are_left_out_together_are_those_left_out_one_by_one():
-    """Many short datasets: the sources of one dataset are eliminated first, and all are left out at once."""
-    rng = np.random.default_rng(9)
-    models = [model(rng, f"m{k}", ("bar", "thermometer") if k % 2 else ("bar",), sources=6) for k in range(9)]
-    values = drawn(rng, models, np.zeros((N, D)))
-    for each in values[1:]:  # one value is known to the first dataset alone
-        each.value[5, 1], each.own[5, 1], each.own[5, :, 1], each.influence[:, 5, 1] = np.nan, np.nan, np.nan, np.nan
-    keys = {key: k for k, key in enumerate(dict.fromkeys(key for each in values for key in each.source))}
-    parts = [Information.of(each, keys) for each in values]
-    assert short(parts, len(keys))
-    assert not short(parts[:2], len(keys))
-    whole, reduced = solve(parts, len(keys)), Reduced.of(parts, len(keys))
-    found = reduced.solution()
-    np.testing.assert_allclose(found.value, whole.value, atol=1e-9 * SCALE.max())
-    covariance = [each.own + np.einsum("sni,snj->nij", each.influence, each.influence) for each in (found, whole)]
-    np.testing.assert_allclose(*covariance, rtol=1e-7)
-    assert found.square == pytest.approx(whole.square, rel=1e-9)
-    left = [solve(parts[:i] + parts[i + 1 :], len(keys)).square for i in range(len(parts))]
-    np.testing.assert_allclose(whole.square - reduced.falls(), left, rtol=1e-9)
 
 
 def test_datasets_without_sources_have_a_consensus():

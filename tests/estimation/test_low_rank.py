@@ -80,3 +80,22 @@ def test_squares_of_differences_to_an_exact_reference_are_a_chi_square():
     squares = [whitener(own, F).square(x) for x in produced(rng, root, F, 400)]
     degrees = whitener(own, F).degrees
     assert np.mean(squares) == pytest.approx(degrees, abs=4 * np.sqrt(2 * degrees / 400))
+
+
+def test_with_variance_in_all_directions_products_are_those_of_the_inverse():
+    rng = np.random.default_rng(1)
+    A = rng.normal(0, 1, (N, D, D)) * SCALE[:, None]
+    own, F = A @ np.swapaxes(A, 1, 2) + np.diag(SCALE**2 / 10), rng.normal(0, 1, (2, N, D)) * SCALE
+    a, b = rng.normal(size=(2, 3, N, D)) * SCALE
+    white = whitener(own, F)
+    expected = a.reshape(3, -1) @ np.linalg.solve(covariance(own, F), b.reshape(3, -1).T)
+    np.testing.assert_allclose(white.product(a, b), expected, rtol=1e-8)
+    assert white.degrees == N * D
+
+
+def test_a_value_that_is_exactly_zero_is_no_evidence():
+    rng = np.random.default_rng(2)
+    own, F = np.tile(np.diag(SCALE**2), (N, 1, 1)), rng.normal(0, 1, (2, N, D)) * SCALE
+    own[0], F[:, 0] = 0.0, 0.0
+    own[3, 2], own[3, :, 2], F[:, 3, 2] = np.nan, np.nan, np.nan
+    assert whitener(own, F).degrees == N * D - D - 1

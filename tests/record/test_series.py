@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from errormotion.estimation.between_runs import fit_runs
 from errormotion.record.control import chart
-from errormotion.record.regression import by_moving_ranges, fit
 from errormotion.record.series import YEAR, Series
 from errormotion.record.steps import Model, model_of
 
@@ -124,7 +124,7 @@ def test_a_shared_source_shifts_the_constant_and_not_the_trend() -> None:
     values = series(np.random.default_rng(5), 20, 0.0, shared=50e-6)
     alone = Series(values.time, values.value, np.sqrt(values.u**2 - 50e-6**2))
     X = np.column_stack([np.ones(20), values.years])
-    shared, without = (fit(X, each.value, each.covariance) for each in (values, alone))
+    shared, without = (fit_runs(X, each.value, each.covariance) for each in (values, alone))
     assert shared is not None
     assert without is not None
     assert shared.parameters[1] == pytest.approx(without.parameters[1], rel=1e-6)
@@ -132,30 +132,6 @@ def test_a_shared_source_shifts_the_constant_and_not_the_trend() -> None:
     assert shared.half_width[0] > 40 * without.half_width[0]
     limits, same = (chart(each, Model(None)) for each in (values, alone))
     assert limits.upper - limits.lower == pytest.approx(same.upper - same.lower, rel=1e-6)
-
-
-@pytest.mark.parametrize("tau", [0.0, 1e-6, 4e-6])
-def test_both_estimates_of_the_reproducibility_are_near_the_truth(tau: float) -> None:
-    rng, n = np.random.default_rng(6), 400
-    values = series(rng, n, tau)
-    X = np.column_stack([np.ones(n), values.years])
-    found = fit(X, values.value, values.covariance)
-    assert found is not None
-    spread = np.sqrt(np.mean(values.u**2) + tau**2)
-    for estimate in (found.tau, by_moving_ranges(values.value, values.covariance)):
-        # variance of an estimated variance: 2 / n, about 1.6 times as much from ranges
-        assert abs(estimate**2 - tau**2) <= 4 * spread**2 * np.sqrt(2 * 1.65 / n)
-
-
-def test_the_trend_is_that_of_ordinary_least_squares_for_equal_uncertainties() -> None:
-    rng, n = np.random.default_rng(7), 12
-    t, y = np.arange(n) * YEAR / 4, rng.normal(0, 5e-6, n)
-    X = np.column_stack([np.ones(n), t / YEAR])
-    found = fit(X, y, np.eye(n) * 1e-14)
-    assert found is not None
-    expected, (square,), *_ = np.linalg.lstsq(X, y, rcond=None)
-    assert found.parameters == pytest.approx(expected, rel=1e-9)
-    assert found.covariance == pytest.approx(np.linalg.inv(X.T @ X) * square / (n - 2), rel=1e-4)
 
 
 def test_values_in_control_are_outside_of_their_limits_as_often_as_three_sigma_state() -> None:

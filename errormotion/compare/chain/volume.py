@@ -21,10 +21,9 @@ from scipy import linalg, special
 
 from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
-from errormotion.compare.normal import Information
-from errormotion.compare.stack import Estimate
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.errors import DatasetError
+from errormotion.estimation.information import weights
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
 
@@ -89,7 +88,7 @@ def predict(
     """
     positions = np.asarray(positions, dtype=float)
     model = Machine(str(volume.attrs["chain"]), {axis: point})
-    fit = _fitted(volume, model, name)
+    fit = _fitted(volume, model)
     k = model.axis_names.index(axis)
     S = np.zeros((positions.size, 6, len(fit.terms)))
     P = legendre.legvander(fit.scaled(positions, k), HIGHEST)
@@ -165,7 +164,7 @@ class _Fit:
         return found
 
 
-def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
+def _fitted(volume: xr.Dataset, model: Machine) -> _Fit:
     """Return the errors of the axes by generalised least squares; sources are nuisance parameters with variance 1."""
     q = np.stack([np.asarray(volume[axis.lower()].values, dtype=float) for axis in model.axis_names], axis=-1)
     y = np.asarray(volume.em.twist().values, dtype=float)
@@ -186,7 +185,7 @@ def _fitted(volume: xr.Dataset, model: Machine, name: str) -> _Fit:
         J = model.jacobian(q[part], tool)
         A = np.stack([J[:, :, e] * (P[e // 6][:, [o]] if o >= 0 else 1.0) for e, o in terms], axis=2)
         A = np.concatenate([A, _rigid_motions(model, q[part], tool, turns), np.moveaxis(F[:, part], 0, 2)], axis=2)
-        W = Information.of(Estimate(name, y[part], own[part], F[:, part], ()), {}).W
+        W, _ = weights(y[part], own[part], F[:, part])
         A, data = np.where(known[part][:, :, None], A, 0.0), np.where(known[part], y[part], 0.0)
         WA = np.einsum("tij,tjp->tip", W, A)
         N += np.einsum("tip,tiq->pq", A, WA, optimize=True)

@@ -1,12 +1,14 @@
-"""Normal equations of a consensus: each dataset is reduced to its information once, for all combinations of datasets.
+"""Generalised least squares of estimates with common sources: each is reduced to its information once.
 
-The covariance of a dataset is ``D + F F'``. Its sources are nuisance parameters z with variance 1 beside the errors x:
+All combinations of the estimates (without one of them, for example) are then sums. An estimate consists of n points
+with d freedoms each; NaN is unknown. Its covariance is ``D + F F'``. Its sources are nuisance parameters z with
+variance 1 beside the errors x:
 
     x-x: W = D^-1        x-z: W F        z-z: 1 + F' W F        right-hand sides: W y, F' W y
 
-They are summed over the datasets. W is block diagonal. The normal matrix of x is inverted point by point, and the
-sources remain: memory and time are linear in the points. If the datasets have more sources than values (many short
-datasets), sources of a single dataset are eliminated first, and values and shared sources remain.
+They are summed over the estimates. W is block diagonal. The normal matrix of x is inverted point by point, and the
+sources remain: memory and time are linear in the points. If the estimates have more sources than values (many short
+estimates), sources of a single estimate are eliminated first, and values and shared sources remain.
 """
 
 from __future__ import annotations
@@ -19,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from errormotion.arrays import Array, filled
-from errormotion.compare.stack import Estimate
 
 FLOOR = 1e-9
 """Smallest variance of a known value without sources, as a fraction of its total variance."""
@@ -54,16 +55,24 @@ class Information:
     known: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, each: Estimate, keys: dict[str, int]) -> Information:
-        """Reduce an estimate; values without any variance are exact by definition, and are not used."""
-        total = filled(each.variance())
-        known = each.known & (total > 0)
-        own = filled(each.own) + FLOOR * total[:, :, None] * np.eye(total.shape[1])
-        W = _inverse(own, known)
-        F = np.where(known[..., None], filled(np.moveaxis(each.influence, 0, -1)), 0.0)
+    def of(cls, value: Array, own: Array, influence: Array, columns: NDArray[np.intp]) -> Information:
+        """Reduce an estimate.
+
+        Parameters
+        ----------
+        value : ndarray, (n, d)
+            NaN is unknown. Values without any variance are exact by definition, and are not used.
+        own : ndarray, (n, d, d)
+            Covariance that is independent from point to point.
+        influence : ndarray, (s, n, d)
+            Effect of one standard uncertainty of each source.
+        columns : ndarray of int, (s,)
+            Number of each source among those of all estimates; sources with the same number are fully correlated.
+        """
+        W, known = weights(value, own, influence)
+        F = np.where(known[..., None], filled(np.moveaxis(influence, 0, -1)), 0.0)
         WF = np.matmul(W, F)
-        y = np.where(known, filled(each.value), 0.0)
-        columns = np.array([keys[key] for key in each.source], dtype=np.intp)
+        y = np.where(known, filled(value), 0.0)
         s = F.shape[-1]
         n = F.shape[0] * F.shape[1]  # -1 is undefined without sources
         inner = F.reshape(n, s).T @ WF.reshape(n, s)
@@ -75,8 +84,26 @@ class Information:
         return float((self.y * self.Wy).sum())
 
 
+def weights(value: Array, own: Array, influence: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the inverses of ``own`` over the known values, (n, d, d), and which these are, (n, d).
+
+    A value is known if it is finite and has a variance. One without variance of its own has a small one.
+    """
+    total = filled(np.diagonal(own, axis1=1, axis2=2) + np.einsum("sni,sni->ni", influence, influence))
+    known = np.isfinite(value) & (total > 0)
+    return _inverse(filled(own) + FLOOR * total[:, :, None] * np.eye(total.shape[1]), known), known
+
+
 def solve(parts: Sequence[Information], sources: int) -> Solution:
-    """Return the generalised least squares estimate of datasets, by elimination of the values."""
+    """Return the generalised least squares estimate of datasets, by elimination of the values.
+
+    Parameters
+    ----------
+    parts : sequence of Information
+        Of the same n points and d freedoms.
+    sources : int
+        Number of sources of all of them.
+    """
     n, d = parts[0].y.shape
     A, right = np.zeros((n, d, d)), np.zeros((n, d))
     B, M, moved = np.zeros((n, d, sources)), np.eye(sources), np.zeros(sources)
@@ -165,7 +192,7 @@ class Reduced:
         influence[:, ~self.seen] = 0.0
         return Solution(self.x[: n * d].reshape(n, d), np.zeros((n, d, d)), influence, self.seen, self.square)
 
-    def falls(self) -> Array:
+    def decreases(self) -> Array:
         """Return the decrease of the sum of squares without each dataset, (m,).
 
         With the residuals r and the information V of a dataset, ``T = (1, S)`` and the normal matrix N of all, the

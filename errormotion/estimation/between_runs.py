@@ -1,15 +1,16 @@
-"""Generalised least squares with a variance between runs, and two estimates of this variance.
+"""Generalised least squares with a variance between runs, and three estimates of this variance.
 
 The model of the values is ``y = X b + m + e``: e has the stated covariance V0, m is the variation of machine and set-up
-from run to run, independent with the standard deviation tau, the reproducibility. Two estimates of tau:
+from run to run, independent with the standard deviation tau, the reproducibility. Estimates of tau:
 
 * Paule and Mandel (J. Res. NBS 87 (1982) 377): tau such that the weighted sum of squared residuals equals its
   expectation, ``r' (V0 + tau^2)^-1 r = n - p``; here with a full covariance and p parameters.
 * Moving ranges, as in a chart of individual values (ISO 7870-2): ``E|y_k - y_(k-1)| = sqrt(2 / pi) sd`` for normal
   values, where ``sd^2 = 2 tau^2 + v_k`` and v_k follows from V0; tau such that the sum of the ranges equals its
   expectation. A step affects one range only, and a trend has little effect.
+* DerSimonian and Laird (Control. Clin. Trials 7 (1986) 177): the first one without iteration, for many means at once.
 
-Both are 0 if the stated uncertainties alone explain the scatter.
+All are 0 if the stated uncertainties alone explain the scatter.
 """
 
 from __future__ import annotations
@@ -19,17 +20,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import brentq
-from scipy.stats import chi2 as chi_square
-from scipy.stats import t as student
+from scipy.special import chdtr, stdtrit
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled
 
 COVERAGE = 0.95
 """Coverage probability of the intervals of trend and steps."""
 
 
 @dataclass(frozen=True)
-class Fit:
+class RunFit:
     """Parameters of a fit.
 
     Attributes
@@ -56,9 +56,19 @@ class Fit:
     fitted_half_width: Array
 
 
-def fit(X: Array, y: Array, V0: Array) -> Fit | None:
-    """Return the fit of ``y = X b`` (n, p); None without degrees of freedom, or for dependent columns.
+def fit_runs(X: Array, y: Array, V0: Array) -> RunFit | None:
+    """Return the fit of ``y = X b``; None without degrees of freedom, or for dependent columns.
 
+    Parameters
+    ----------
+    X : ndarray, (n, p)
+    y : ndarray, (n,)
+        Values, in any unit, which is also that of tau.
+    V0 : ndarray, (n, n)
+        Stated covariance of the values.
+
+    Notes
+    -----
     The quantile is that of Student's distribution with n - p degrees of freedom, with which tau is estimated.
     """
     n, p = X.shape
@@ -70,16 +80,19 @@ def fit(X: Array, y: Array, V0: Array) -> Fit | None:
     factor = cho_factor(V)
     C = np.asarray(np.linalg.inv(X.T @ cho_solve(factor, X)), dtype=float)
     b: Array = C @ (X.T @ cho_solve(factor, y))
-    quantile = float(student.ppf(0.5 + COVERAGE / 2, n - p))
+    quantile = float(stdtrit(n - p, 0.5 + COVERAGE / 2))
     spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))
-    below = float(chi_square.cdf(chi2, n - p))
+    below = float(chdtr(n - p, chi2))
     half_width: Array = quantile * np.sqrt(np.diag(C))
     fitted: Array = X @ b
-    return Fit(b, half_width, C, tau, chi2, below, n - p, fitted, quantile * spread)
+    return RunFit(b, half_width, C, tau, chi2, below, n - p, fitted, quantile * spread)
 
 
 def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> float:
-    """Return tau from the moving ranges of residuals (n,); ``used`` (n - 1,) selects ranges, such as all but steps."""
+    """Return tau from the moving ranges of residuals (n,) with the stated covariance V0 (n, n).
+
+    ``used`` (n - 1,) selects ranges, such as all but those across steps.
+    """
     d = np.abs(np.diff(residual))
     v = difference_variance(V0)
     if used is not None:
@@ -99,6 +112,40 @@ def difference_variance(V: Array) -> Array:
     diagonal = np.diag(V)
     found: Array = np.maximum(diagonal[1:] + diagonal[:-1] - 2 * np.diag(V, 1), 0.0)
     return found
+
+
+def variance_between(value: Array, variance: Array) -> tuple[Array, Array, Array]:
+    """Return weighted means over m datasets, with a variance between datasets (DerSimonian and Laird 1986).
+
+    Parameters
+    ----------
+    value, variance : ndarray, (m, n, d)
+        Values of each dataset at n points with d freedoms, and their stated variances; NaN is unknown, and a value
+        without variance is not used.
+
+    Returns
+    -------
+    value, u : ndarray, (n, d)
+        Mean and its standard uncertainty; NaN if unknown to all.
+    tau : ndarray, (d,)
+        Standard deviation between datasets of each freedom, from all points together.
+    """
+    known = np.isfinite(value) & (variance > 0)
+    w = np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
+    total = w.sum(axis=0)
+    y = filled(value)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = (w * y).sum(axis=0) / total
+    Q = np.nansum((w * (y - filled(mean)) ** 2), axis=0)
+    degrees = np.maximum(known.sum(axis=0) - 1, 0)
+    c = np.where(total > 0, total - (w**2).sum(axis=0) / np.where(total > 0, total, 1.0), 0.0)
+    weight = c.sum(axis=0)
+    tau2 = np.maximum((Q - degrees).sum(axis=0), 0.0) / np.where(weight > 0, weight, np.inf)
+    w = np.where(known, 1.0 / np.where(known, variance + tau2, 1.0), 0.0)
+    total = w.sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean, u = (w * y).sum(axis=0) / total, np.sqrt(1.0 / total)
+    return np.where(total > 0, mean, np.nan), np.where(total > 0, u, np.nan), np.sqrt(tau2)
 
 
 def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
