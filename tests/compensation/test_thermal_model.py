@@ -14,7 +14,6 @@ from errormotion.compensation.thermal_model import Settings, ThermalModel, check
 from errormotion.compensation.thermal_model.fitting import MIN_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
-from errormotion.compensation.thermal_model.regression import left_out_residuals
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 
@@ -243,14 +242,6 @@ def test_the_page_of_schemas_has_the_table_of_the_model() -> None:
     for line, row in zip(reported, ROWS, strict=True):
         assert row.meaning in line
         assert ", ".join(row.dims) in line
-
-
-def test_nothing_is_predicted_for_a_campaign_without_another() -> None:
-    rng = np.random.default_rng(0)
-    inputs, errors, campaign = rng.standard_normal((8, 2)), rng.standard_normal(8), np.repeat([0, 1], 4)
-    known = left_out_residuals(inputs, errors, np.ones(8), campaign)
-    assert np.isfinite(known).all()
-    assert np.isnan(left_out_residuals(inputs, errors, np.repeat([1.0, 0.0], 4), campaign)).all()
 
 
 def test_an_error_that_only_one_campaign_contains_is_not_modelled(pair: list[xr.Dataset]) -> None:

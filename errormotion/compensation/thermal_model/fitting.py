@@ -16,13 +16,14 @@ import xarray as xr
 from scipy.special import stdtrit
 
 from errormotion.arrays import Array
-from errormotion.compensation.thermal_model import regression
+from errormotion.compensation.thermal_model import training
 from errormotion.compensation.thermal_model.features import Feature, dynamics, lagged
 from errormotion.compensation.thermal_model.model import Parts, ThermalModel
 from errormotion.compensation.thermal_model.record import instruments_of, read_record
 from errormotion.compensation.thermal_model.settings import Settings
 from errormotion.datasets import provenance
 from errormotion.errors import DatasetError
+from errormotion.estimation import ridge
 
 LAGS: tuple[tuple[float, ...], ...] = ((), (600.0,), (1800.0,), (600.0, 1800.0))
 TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (
@@ -104,7 +105,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
             f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns together, of two campaigns if "
             "there are several; found no such error."
         )
-    columns = regression.Columns(records)
+    columns = training.Columns(records)
     best, tried = _chosen(columns, seen, settings)
     return _made(campaigns, columns, seen, best, tried, settings)
 
@@ -149,7 +150,7 @@ def _check_alike(campaigns: Sequence[xr.Dataset]) -> None:
             )
 
 
-def _chosen(columns: regression.Columns, seen: Sequence[int], settings: Settings) -> tuple[Candidate, list[Candidate]]:
+def _chosen(columns: training.Columns, seen: Sequence[int], settings: Settings) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, and the best candidates of all variants and constants."""
     records = columns.records
     temperatures = [r.inputs.temperature for r in records]
@@ -193,7 +194,7 @@ def _has_signal(temperature: Array) -> bool:
 
 
 def _with_sensors(
-    columns: regression.Columns,
+    columns: training.Columns,
     seen: Sequence[int],
     variant: str,
     constants: tuple[float, ...],
@@ -225,18 +226,18 @@ def _with_sensors(
     return best
 
 
-def _score(columns: regression.Columns, seen: Sequence[int], features: Sequence[Feature]) -> float:
+def _score(columns: training.Columns, seen: Sequence[int], features: Sequence[Feature]) -> float:
     X, _ = columns.of(features)
-    group = regression.groups(columns.records)
+    group = training.groups(columns.records)
     use = _in_use(X, features) if len(columns.records) == 1 else None
     total = 0.0
     for freedom in seen:
-        y, weight = regression.target(columns.records, freedom)
-        size = regression.mean_square(y, weight)
+        y, weight = training.target(columns.records, freedom)
+        size = ridge.mean_square(y, weight)
         if size > 0:
-            strength, square, residual = regression.best_strength(X, y, weight, group)
+            strength, square, residual = ridge.best_strength(X, y, weight, group)
             if use is not None:
-                variance = regression.covariance(X, weight, strength, square, residual, group)
+                variance = ridge.covariance(X, weight, strength, square, residual, group)
                 square += float(np.sum(variance * use))
             total += square / size
     return total
@@ -256,14 +257,14 @@ def _in_use(X: Array, features: Sequence[Feature]) -> Array:
 
 def _made(
     campaigns: Sequence[xr.Dataset],
-    columns: regression.Columns,
+    columns: training.Columns,
     seen: Sequence[int],
     best: Candidate,
     tried: Sequence[Candidate],
     settings: Settings,
 ) -> ThermalModel:
     X, scale = columns.of(best.features)
-    group = regression.groups(columns.records)
+    group = training.groups(columns.records)
     p = len(best.features)
     coefficient = np.full((6, p), np.nan)
     covariance = np.full((6, p, p), np.nan)
@@ -271,23 +272,23 @@ def _made(
     strengths = np.full(6, np.nan)
     removed = np.full(6, np.nan)
     for k in seen:
-        y, weight = regression.target(columns.records, k)
-        strength, _, residual = regression.best_strength(X, y, weight, group)
+        y, weight = training.target(columns.records, k)
+        strength, _, residual = ridge.best_strength(X, y, weight, group)
         known = (weight > 0) & np.isfinite(X).all(axis=1)
         strengths[k] = strength
-        coefficient[k] = regression.solve(X[known], y[known], weight[known], np.array([strength]))[0] / scale
+        coefficient[k] = ridge.solve(X[known], y[known], weight[known], np.array([strength]))[0] / scale
         # The campaign with the largest residuals determines the uncertainty of a new one.
         square = max(
             found
             for number in np.unique(group)
-            if np.isfinite(found := regression.mean_square(residual[group == number], weight[group == number]))
+            if np.isfinite(found := ridge.mean_square(residual[group == number], weight[group == number]))
         )
-        freedom = max(regression.effective_count(residual, group), 1.0)
+        freedom = max(ridge.effective_count(residual, group), 1.0)
         # Standard uncertainty with few degrees of freedom, enlarged so that k = 1.96 gives 95 %.
         misfit[k] = np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
-        of_scaled = regression.covariance(X, weight, strength, square, residual, group)
+        of_scaled = ridge.covariance(X, weight, strength, square, residual, group)
         covariance[k] = of_scaled / np.outer(scale, scale)
-        removed[k] = 1 - np.sqrt(regression.mean_square(residual, weight) / regression.mean_square(y, weight))
+        removed[k] = 1 - np.sqrt(ridge.mean_square(residual, weight) / ridge.mean_square(y, weight))
     physical = X[np.isfinite(X).all(axis=1)] * scale
     parts = Parts(
         best.features, coefficient, covariance, misfit, strengths, removed, physical.min(axis=0), physical.max(axis=0)
