@@ -44,7 +44,8 @@ class Table:
         The change of a value over which the model bends noticeably: the radius of a ball, a lever, 1 rad. Derivatives
         are differences over a small part of it.
     group : str
-        The name in the budget.
+        The name in the budget. A block of unknowns without one is seen by a single place each, such as the errors of
+        an instant: its uncertainty is independent from place to place, and it can be eliminated.
     """
 
     index: Index
@@ -118,6 +119,8 @@ class Constant(Table):
     factor : ndarray, (size, width, k)
         The effect of k independent sources, each of one standard uncertainty: the covariance of all values is
         ``factor factor'``.
+    names : sequence of str, (k,)
+        What each source is called; by default the group, numbered.
     identity : sequence of str, (k,)
         What each source is, so that two results that share it share its error ("certificate 17: bar, radius");
         empty texts, or none, for sources of this result alone.
@@ -128,6 +131,7 @@ class Constant(Table):
 
     value: Array
     factor: Array
+    names: Sequence[str] = ()
     identity: Sequence[str] = ()
     adjust: bool = False
 
@@ -138,10 +142,9 @@ class Constant(Table):
                 f"constant '{self.group}': expected a factor of shape {(*self.value.shape, 'k')}; "
                 f"found {self.factor.shape}"
             )
-        if len(self.identity) not in (0, self.factor.shape[2]):
-            raise FitError(
-                f"constant '{self.group}': expected {self.factor.shape[2]} identities; found {len(self.identity)}"
-            )
+        for what in ("names", "identity"):
+            if len(given := getattr(self, what)) not in (0, self.sources):
+                raise FitError(f"constant '{self.group}': expected {self.sources} {what}; found {len(given)}")
 
     @property
     def sources(self) -> int:

@@ -18,9 +18,6 @@ from errormotion.estimation.normal import Normal, factorised
 
 __all__ = ["Linear", "Problem", "linearised"]
 
-DENSE = 150
-"""Largest number of unknowns that are all kept in the border: no elimination is faster for so few."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
@@ -146,11 +143,10 @@ class Numbering:
 
     @classmethod
     def of(cls, problem: Problem) -> Numbering:
-        """Return the numbering: the largest block is eliminated, if there are many unknowns."""
+        """Return the numbering: the largest block without a group is eliminated."""
         counts = [int(block.freed.sum()) for block in problem.unknowns]
-        local = None
-        if sum(counts) > DENSE:
-            local = max(range(len(counts)), key=counts.__getitem__)
+        own = [k for k, block in enumerate(problem.unknowns) if not block.group]
+        local = max(own, key=counts.__getitem__, default=None)
         position, border = 0, []
         for k, block in enumerate(problem.unknowns):
             number = np.zeros((0, 0), dtype=np.intp)
@@ -227,7 +223,7 @@ class Linear:
             prior = np.where(block.freed, block.information, 1.0)
             band[0] += prior[:, :, None] * np.eye(prior.shape[1])
             a = np.where(block.freed, a + block.information * (self.at.tables[number.local] - block.start), 0.0)
-        prior, offset = self._border_prior()
+        prior, offset = self.border_prior()
         D[np.arange(q), np.arange(q)] += prior
         normal = factorised(band, G, D, self._gauge())
         return normal, -a, -(b + prior * offset)
@@ -301,7 +297,7 @@ class Linear:
             tables.append(table + step)
         return Unknown(tables, [z + b[n] for z, n in zip(self.at.adjusted, self.numbering.adjusted, strict=True)])
 
-    def _border_prior(self) -> tuple[Array, Array]:
+    def border_prior(self) -> tuple[Array, Array]:
         """Return the information of the priors of the border, and the distance from their centre, (q,)."""
         q = self.numbering.size
         information, offset = np.zeros(q + 1), np.zeros(q + 1)
@@ -314,7 +310,7 @@ class Linear:
 
     def prior_square(self) -> float:
         """Return the sum of squares of the distances from the priors, in units of their standard deviations."""
-        information, offset = self._border_prior()
+        information, offset = self.border_prior()
         total = float(information @ np.square(offset))
         if self.numbering.local is not None:
             block = problem_block(self)

@@ -1,0 +1,265 @@
+"""From a fit to errors at places, with their covariance as an independent part and the effects of named sources.
+
+Errors are functions of rows of the same tables as the readings: ``e = errors(x, c)``. With the derivatives J by the
+local row of a place, B by the border, and the normal equations of the fit
+
+* the readings make the covariance ``J T^-1 J'``, independent from place to place, and with the effect
+  ``E = B - J F`` of the border its covariance ``E S^-1 E'``, common to the places;
+* a constant taken as it is changes the unknowns by ``-N^-1 R' V^-1 (dr/dc)``, and the errors directly by ``de/dc``;
+* a prior, such as that of an adjusted constant, has the effect ``cov(e, z) / sd``; what remains of ``S^-1`` is that of
+  the readings, ``S^-1 (S - prior) S^-1``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.blocks import Constant, Index, Table
+from errormotion.estimation.derivatives import by_rows, column
+from errormotion.estimation.fit import Fit
+from errormotion.estimation.problem import Problem
+
+__all__ = ["Errors", "Places", "Source", "errors_of"]
+
+_CHUNK = 64
+"""Sources whose effects are computed at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where errors are wanted.
+
+    Attributes
+    ----------
+    equation : callable
+        ``equation(x, c)`` returns the errors (place,) or (place, d) from the rows of unknowns and constants.
+    rows : mapping of str to ndarray of int, (place,) or (place, w)
+        The rows of each table, by its name among the unknowns and constants. A table of one row needs none; one with as
+        many rows as there are places has one for each. Of any other the equation receives NaN: the errors do not
+        depend on it.
+    weights : mapping of str to ndarray, (place, w)
+        The equation receives sums of rows with these weights.
+    count : int
+        Number of places.
+    """
+
+    equation: Callable[[Any, Any], Array]
+    count: int
+    rows: Mapping[str, Index] = field(default_factory=dict)
+    weights: Mapping[str, Array] = field(default_factory=dict)
+
+    def tables(self, problem: Problem, values: Sequence[Array]) -> list[Table | None]:
+        """Return the index map of each table with these values; None for one that the errors do not depend on."""
+        names = [*getattr(problem.unknowns, "_fields", ()), *getattr(problem.constants, "_fields", ())]
+        return [
+            self._table(name, table, len(value))
+            for name, table, value in zip(names, problem.tables, values, strict=True)
+        ]
+
+    def _table(self, name: str, table: Table, size: int) -> Table | None:
+        index = self.rows.get(name)
+        if index is None:
+            if size not in (1, self.count):
+                return None
+            index = np.arange(self.count) if size == self.count else np.zeros(self.count, dtype=np.intp)
+        return Table(index=index, weight=self.weights.get(name), scale=table.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """One draw for many places: its effect (place, d) by one standard uncertainty, name, group and identity."""
+
+    name: str
+    group: str
+    effect: Array
+    identity: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors at places.
+
+    Attributes
+    ----------
+    value : ndarray, (place, d)
+    own : ndarray, (place, d, d)
+        Covariance that is independent from place to place.
+    sources : list of Source
+        All others.
+    """
+
+    value: Array
+    own: Array
+    sources: list[Source]
+
+    @property
+    def influence(self) -> Array:
+        """Effects of all sources, (source, place, d)."""
+        return np.array([source.effect for source in self.sources]).reshape(-1, *self.value.shape)
+
+    @property
+    def covariance(self) -> Array:
+        """Total at each place, (place, d, d)."""
+        F = self.influence
+        return np.asarray(self.own + np.einsum("spi,spj->pij", F, F, optimize=True))
+
+    def budget(self) -> dict[str, Array]:
+        """Return the standard uncertainty by each group, (place, d); that of the independent part has the name ''."""
+        found = {"": np.sqrt(np.maximum(np.diagonal(self.own, axis1=1, axis2=2), 0.0))}
+        for source in self.sources:
+            found[source.group] = np.hypot(found.get(source.group, 0.0), source.effect)
+        return found
+
+
+def errors_of(fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "readings") -> Errors:
+    """Return the errors of a fit.
+
+    Parameters
+    ----------
+    fit : Fit
+    places : Places
+    factor : float
+        Variance factor of the readings; their part only is multiplied by it.
+    shared : str
+        Group of what the readings contribute to all places together, by the border. With one place it is independent.
+    """
+    problem, linear, normal = fit.problem, fit.linear, fit.normal
+    values = [*linear.at.tables, *problem.constant_tables(linear.at)]
+    maps = places.tables(problem, values)
+    seen = [k for k, table in enumerate(maps) if table is not None]
+    unseen = [np.full((places.count, value.shape[1]), np.nan) for value in values]
+    count = len(problem.unknowns)
+
+    def equation(each: list[Array]) -> Array:
+        rows = unseen.copy()
+        for k, row in zip(seen, each, strict=True):
+            rows[k] = row
+        return column(places.equation(*problem.named(rows[:count], rows[count:])))
+
+    tables = {k: table for k, table in enumerate(maps) if table is not None}
+    value = equation([table.rows(values[k]) for k, table in tables.items()])
+    if not np.isfinite(value).any():
+        names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
+        without = ", ".join(names[k] for k in range(len(names)) if k not in tables)
+        raise FitError(
+            f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})"
+        )
+    its = by_rows(equation, list(tables.values()), [values[k] for k in seen], range(len(seen)))
+    J = dict(zip(seen, its, strict=True))
+    own, E, local, index = _by_place(fit, tables, J)
+    sources = list[Source]()
+    if E.shape[2]:
+        root = normal.root
+        information = _prior(fit)
+        C = root @ root.T
+        for name, group, identity, at in _priors(fit):
+            sources.append(Source(name, group, E @ C[:, at] * np.sqrt(information[at]), identity))
+        # S^-1 (S - prior) S^-1 = K K' with K = root (1 - root' prior root)^(1/2)
+        power, vectors = np.linalg.eigh(np.eye(root.shape[1]) - (root.T * information) @ root)
+        K = E @ (root @ (vectors * np.sqrt(np.maximum(power, 0.0)))) * np.sqrt(factor)
+        if places.count == 1:
+            own = own * factor + K @ np.swapaxes(K, 1, 2)
+        else:
+            own = own * factor
+            sources += [Source(f"{shared} {k + 1}", shared, K[..., k]) for k in range(K.shape[2]) if K[..., k].any()]
+    else:
+        own = own * factor
+    for k, constant in enumerate(problem.constants):
+        if not constant.adjust and constant.sources:
+            sources += _of_constant(fit, tables, J, k, local, index, E)
+    return Errors(value, own, sources)
+
+
+def _by_place(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array]) -> tuple[Array, Array, Array, Index]:
+    """Return own covariances (place, d, d), the effect E of the border (place, d, q), J of the local row, its index."""
+    problem, linear, normal = fit.problem, fit.linear, fit.normal
+    number, q = linear.numbering, linear.numbering.size
+    count, d = next(iter(J.values())).shape[:2]
+    E = np.zeros((count, d, q + 1))
+    own = np.zeros((count, d, d))
+    local, index = np.zeros((count, d, 1)), np.zeros(count, dtype=np.intp)
+    for k, block in enumerate(problem.unknowns):
+        if k not in J:
+            continue
+        each = J[k]
+        if k == number.local:
+            if each.shape[2] > 1:
+                raise FitError("places: expected one row of the eliminated unknowns for each place")
+            index = tables[k].index2[:, 0]
+            local = each[:, :, 0] * block.freed[index][:, None, :]
+            own = local @ normal.own[index] @ np.swapaxes(local, 1, 2)
+            E[..., :q] -= local @ normal.F[index]
+            continue
+        columns = number.border[k][tables[k].index2].reshape(count, -1)
+        flat = each.reshape(count, d, -1)
+        for j in range(flat.shape[2]):
+            E[np.arange(count), :, columns[:, j]] += flat[:, :, j]
+    for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
+        at = len(problem.unknowns) + k
+        if at in J:
+            E[..., its] += np.einsum("pdwc,pwcz->pdz", J[at], constant.factor[tables[at].index2])
+    return own, E[..., :q], local, index
+
+
+def _prior(fit: Fit) -> Array:
+    """Return the information of the priors of the border, (q,)."""
+    return fit.linear.border_prior()[0]
+
+
+def _priors(fit: Fit) -> list[tuple[str, str, str, int]]:
+    """Return name, group, identity and number of every unknown of the border that has a prior."""
+    problem, number = fit.problem, fit.linear.numbering
+    found = []
+    for name, block, border in zip(problem.unknowns._fields, problem.unknowns, number.border, strict=True):
+        if not border.size:
+            continue
+        for row, col in np.argwhere(block.freed & (block.information > 0)):
+            found.append((f"{block.group or name} {row + 1}.{col + 1}", block.group or name, "", int(border[row, col])))
+    for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
+        names, ids = _named(constant, problem.constants._fields[k])
+        found += [(name, constant.group, one, int(at)) for name, one, at in zip(names, ids, its, strict=True)]
+    return found
+
+
+def _named(constant: Constant, name: str) -> tuple[Sequence[str], Sequence[str]]:
+    """Return names and identities of the sources of a constant."""
+    k, base = constant.sources, constant.group or name
+    names = constant.names or ([base] if k == 1 else [f"{base} {j + 1}" for j in range(k)])
+    return names, constant.identity or [""] * k
+
+
+def _of_constant(
+    fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array], k: int, local: Array, index: Index, E: Array
+) -> list[Source]:
+    """Return the sources of a constant that is taken as it is."""
+    problem, linear = fit.problem, fit.linear
+    constant: Constant = problem.constants[k]
+    at = len(problem.unknowns) + k
+    values = [*linear.at.tables, *problem.constant_tables(linear.at)]
+    R = by_rows(lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, [at])[0]
+    white = np.einsum("nij,njwc->niwc", linear.whitener, np.where(linear.used[:, :, None, None], R, 0.0))
+    names, identities = _named(constant, problem.constants._fields[k])
+    found = []
+    for first in range(0, constant.sources, _CHUNK):
+        part = slice(first, first + _CHUNK)
+        factor = constant.factor[..., part]
+        change = np.einsum("niwc,nwcz->niz", white, factor[constant.index2])
+        a, b = linear.gradient(change)
+        x, z = fit.normal.solve(-a, -b)
+        effect = E @ z
+        if at in J:
+            effect += np.einsum("pdwc,pwcz->pdz", J[at], factor[tables[at].index2])
+        if linear.numbering.local is not None:
+            # x = T^-1 (-a - G z): E z contains -F z already
+            effect += local @ (x[index] + fit.normal.F[index] @ z)
+        found += [
+            Source(names[first + j], constant.group, effect[..., j], identities[first + j])
+            for j in range(effect.shape[2])
+        ]
+    return found

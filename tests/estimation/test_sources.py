@@ -1,0 +1,215 @@
+"""Errors at places with their sources, against dense propagation and Monte Carlo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import pytest
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.datum import Datum, relative
+from errormotion.estimation.fit import fit
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.sources import Errors, Places, Source, errors_of
+
+T = TypeVar("T")
+
+
+class Unknowns(NamedTuple, Generic[T]):
+    error: T
+    offset: T
+
+
+class Known(NamedTuple, Generic[T]):
+    scale: T
+    temperature: T
+
+
+TARGETS, RUNS = 12, 4
+POSITION = np.linspace(0.1, 1.2, TARGETS)
+TARGET, RUN = (each.ravel() for each in np.meshgrid(np.arange(TARGETS), np.arange(RUNS), indexing="ij"))
+SD = 1e-6
+PRIOR = 3e-6
+
+
+def equation(y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
+    """Return reading minus prediction: errors, run offsets, and a scale that also heats up."""
+    heat = 11e-6 * (c.temperature[:, 0] - 20.0)
+    return np.asarray(y - x.error[:, 0] - x.offset[:, 0] - POSITION[TARGET] * (c.scale[:, 0] + heat))
+
+
+def errors(x: Unknowns[Array], c: Known[Array]) -> Array:
+    """Return the error at each target, with 1 more of the scale."""
+    return np.asarray(x.error[:, 0] + 0.5 * POSITION * c.scale[:, 0])
+
+
+def problem(y: Array, *, adjust: bool = False, scale: float = 1e-6) -> Problem:
+    zero = np.zeros(TARGET.size, dtype=int)
+    unknowns = Unknowns(
+        Block(start=np.zeros((TARGETS, 1)), index=TARGET, scale=1.0),
+        Block(start=np.zeros((RUNS, 1)), index=RUN, scale=1.0, prior=PRIOR, group="drift"),
+    )
+    constants = Known(
+        Constant(
+            value=np.array([[scale]]), factor=np.full((1, 1, 1), 2e-6), index=zero, scale=1.0, group="scale",
+            identity=["certificate 17: scale"], adjust=adjust,
+        ),
+        Constant(value=np.array([[21.0]]), factor=np.full((1, 1, 1), 0.2), index=zero, scale=1.0, group="expansion"),
+    )  # fmt: skip
+    return Problem(
+        equation=equation, readings=y, unknowns=unknowns, constants=constants, noise=Noise(sd=np.full(TARGET.size, SD))
+    )
+
+
+def dense() -> tuple[Array, Array]:
+    """Return the estimator matrix of the errors for readings and priors, and the covariance."""
+    A = np.zeros((TARGET.size + RUNS, TARGETS + RUNS))
+    A[np.arange(TARGET.size), TARGET] = 1 / SD
+    A[np.arange(TARGET.size), TARGETS + RUN] = 1 / SD
+    A[TARGET.size + np.arange(RUNS), TARGETS + np.arange(RUNS)] = 1 / PRIOR
+    C = np.linalg.inv(A.T @ A)
+    return np.asarray((C @ A.T)[:TARGETS], dtype=float), np.asarray(C[:TARGETS, :TARGETS], dtype=float)
+
+
+def whole(found: Errors) -> Array:
+    """Return the covariance of all places (place, place) of one freedom."""
+    F = found.influence[:, :, 0]
+    return np.asarray(np.diag(found.own[:, 0, 0]) + F.T @ F)
+
+
+def test_the_covariance_is_that_of_the_dense_propagation() -> None:
+    found = errors_of(fit(problem(np.zeros(TARGET.size))), Places(errors, TARGETS))
+    gain, C = dense()
+    of_readings = gain[:, : TARGET.size] / SD
+    scale = -of_readings @ (POSITION[TARGET] * 2e-6) + 0.5 * POSITION * 2e-6
+    heat = -of_readings @ (POSITION[TARGET] * 11e-6 * 0.2)
+    expected = C + np.outer(scale, scale) + np.outer(heat, heat)
+    assert whole(found) == pytest.approx(expected, rel=1e-6)
+    effects = {source.group: source.effect[:, 0] for source in found.sources}
+    assert effects["scale"] == pytest.approx(scale, rel=1e-7)
+    assert effects["expansion"] == pytest.approx(heat, rel=1e-7)
+    assert [source.identity for source in found.sources if source.identity] == ["certificate 17: scale"]
+    # the drift is the effect of the priors of the runs: cov(e, z) / sd
+    drift = sum(np.square(s.effect[:, 0]) for s in found.sources if s.group == "drift")
+    assert drift == pytest.approx(np.sum(np.square(gain[:, TARGET.size :]), axis=1), rel=1e-6)
+    budget = found.budget()
+    total = np.sum([np.square(part) for part in budget.values()], axis=0)
+    assert total[:, 0] == pytest.approx(np.diag(expected), rel=1e-6)
+
+
+def test_an_adjusted_constant_keeps_its_identity_and_its_part() -> None:
+    """The readings of this test do not see the scale: adjusting it changes nothing."""
+    y = np.zeros(TARGET.size)
+    taken = errors_of(fit(problem(y)), Places(errors, TARGETS))
+    adjusted = errors_of(fit(problem(y, adjust=True)), Places(errors, TARGETS))
+    assert whole(adjusted) == pytest.approx(whole(taken), rel=1e-5)
+    one, other = (next(s for s in each.sources if s.identity) for each in (taken, adjusted))
+    assert one.effect == pytest.approx(other.effect, rel=1e-5)
+
+
+def test_readings_that_see_a_constant_improve_it() -> None:
+    """With a known target at the far end, the scale is measured."""
+    sharp = problem(np.zeros(TARGET.size), adjust=True)
+    block = replace(sharp.unknowns.error, prior=1e-9)
+    better = replace(sharp, unknowns=sharp.unknowns._replace(error=block))
+    u = [np.sqrt(errors_of(fit(each), Places(errors, TARGETS)).covariance[-1, 0, 0]) for each in (sharp, better)]
+    assert u[1] < 0.7 * u[0]
+
+
+def test_the_intervals_contain_the_truth() -> None:
+    """Monte Carlo of readings, drift and constants: the spread of the errors is the stated one."""
+    rng = np.random.default_rng(5)
+    stated = errors_of(fit(problem(np.zeros(TARGET.size))), Places(errors, TARGETS))
+    gain, _ = dense()
+    misses = []
+    for _ in range(4000):
+        drift = PRIOR * rng.standard_normal(RUNS)
+        scale = 1e-6 + 2e-6 * rng.standard_normal()
+        temperature = 21.0 + 0.2 * rng.standard_normal()
+        y = drift[RUN] + POSITION[TARGET] * (scale + 11e-6 * (temperature - 20.0)) + SD * rng.standard_normal(RUN.size)
+        believed = y - POSITION[TARGET] * (1e-6 + 11e-6)
+        found = gain[:, : TARGET.size] @ believed / SD + 0.5 * POSITION * 1e-6
+        misses.append(found - 0.5 * POSITION * scale)
+    spread = np.asarray(np.cov(np.array(misses).T), dtype=float)
+    assert np.sqrt(np.diag(spread)) == pytest.approx(np.sqrt(stated.covariance[:, 0, 0]), rel=0.05)
+    between = spread[0, -1] / np.sqrt(spread[0, 0] * spread[-1, -1])
+    assert between == pytest.approx(
+        whole(stated)[0, -1] / np.sqrt(whole(stated)[0, 0] * whole(stated)[-1, -1]), abs=0.05
+    )
+
+
+def test_a_variance_factor_scales_the_readings_only() -> None:
+    found = fit(problem(np.zeros(TARGET.size)))
+    one, four = (errors_of(found, Places(errors, TARGETS), factor=f) for f in (1.0, 4.0))
+    assert four.own == pytest.approx(4 * one.own)
+    for a, b in zip(one.sources, four.sources, strict=True):
+        assert b.effect == pytest.approx(a.effect * (2.0 if a.group == "readings" else 1.0), rel=1e-9)
+
+
+def test_places_without_rows_name_the_tables() -> None:
+    with pytest.raises(FitError, match=r"all errors are NaN.*\(without: error, offset\)"):
+        errors_of(fit(problem(np.zeros(TARGET.size))), Places(lambda x, c: x.error, 5))
+
+
+def _line() -> Array:
+    return np.stack([np.ones(TARGETS), POSITION], axis=1)[:, None, :]
+
+
+def test_a_line_through_the_ends_is_exact() -> None:
+    found = errors_of(fit(problem(np.zeros(TARGET.size))), Places(errors, TARGETS))
+    weight = np.zeros((TARGETS, 1))
+    weight[[0, -1]] = 1.0
+    result = relative(found, Datum(_line(), weight, "ends"))
+    t = (POSITION - POSITION[0]) / (POSITION[-1] - POSITION[0])
+    M = np.eye(TARGETS)
+    M[:, 0] -= 1 - t
+    M[:, -1] -= t
+    assert whole(result.errors) == pytest.approx(M @ whole(found) @ M.T, rel=1e-8, abs=1e-20)
+    assert result.errors.covariance[[0, -1]] == pytest.approx(np.zeros((2, 1, 1)), abs=1e-20)
+
+
+def test_a_datum_of_many_places_has_exact_totals() -> None:
+    rng = np.random.default_rng(6)
+    n = 200
+    own = np.square(rng.uniform(0.5, 2.0, n))[:, None, None]
+    before = Errors(rng.standard_normal((n, 1)), own, [Source("scale", "scale", rng.standard_normal((n, 1)))])
+    A = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)
+    result = relative(before, Datum(A[:, None, :], np.ones((n, 1)), "network", ["offset", "slope"]))
+    M = np.eye(n) - A @ np.linalg.pinv(A)
+    assert result.errors.value[:, 0] == pytest.approx(M @ before.value[:, 0])
+    assert result.errors.covariance[:, 0, 0] == pytest.approx(np.diag(M @ whole(before) @ M.T), rel=1e-9)
+    H = np.linalg.pinv(A)
+    assert result.coefficient == pytest.approx(H @ before.value[:, 0])
+    assert result.covariance == pytest.approx(H @ whole(before) @ H.T, rel=1e-9)
+
+
+def test_an_unknown_value_defines_no_datum() -> None:
+    before = Errors(np.array([[np.nan], [1.0], [2.0]]), np.ones((3, 1, 1)), [])
+    reference = Datum(np.ones((3, 1, 1)), np.array([[1.0], [1.0], [0.0]]), "reference")
+    result = relative(before, reference)
+    assert result.errors.value[1:, 0] == pytest.approx([0.0, 1.0])
+    assert np.isnan(result.errors.value[0, 0])
+    with pytest.raises(FitError, match="do not determine the datum"):
+        relative(before, replace(reference, weight=np.array([[1.0], [0.0], [0.0]])))
+
+
+def test_one_place_has_no_shared_part() -> None:
+    """A beam from planes: with a single place, what its readings share is independent."""
+    rng = np.random.default_rng(7)
+    X = rng.standard_normal((30, 3))
+
+    class One(NamedTuple, Generic[T]):
+        beam: T
+
+    def line(y: Array, x: One[Array], c: Any) -> Array:
+        return np.asarray(y - np.sum(X * x.beam, axis=1))
+
+    block = Block(start=np.zeros((1, 3)), index=np.zeros(30, dtype=int), scale=1.0, group="beam")
+    found = fit(Problem(equation=line, readings=np.zeros(30), unknowns=One(block), noise=Noise(sd=np.ones(30))))
+    result = errors_of(found, Places(lambda x, c: x.beam, 1))
+    assert result.sources == []
+    assert result.own[0] == pytest.approx(np.linalg.inv(X.T @ X), rel=1e-9)
