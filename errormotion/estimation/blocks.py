@@ -84,14 +84,23 @@ class Block(Table):
         What is estimated; the others keep their start. Default: all.
     prior : float or ndarray, broadcast to (size, width), optional
         Standard deviation about ``start``; infinite without a prior.
+    component : sequence of str, (width,), optional
+        Columns whose rows are random effects, independent from row to row about ``start``, with a variance that the
+        readings determine (`components`): its name, or "" for columns without. Columns of the same name have the same
+        variance.
     """
 
     start: Array
     free: NDArray[np.bool_] | None = None
     prior: float | Array | None = None
+    component: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         _check(self, self.start)
+        if len(self.component) not in (0, self.start.shape[1]):
+            raise FitError(f"'{self.group}': expected {self.start.shape[1]} components; found {len(self.component)}")
+        if self.prior is not None and not (np.asarray(self.prior) > 0).all():
+            raise FitError(f"'{self.group}': expected standard deviations above 0 of the prior; found {self.prior}")
 
     @cached_property
     def freed(self) -> NDArray[np.bool_]:

@@ -90,15 +90,20 @@ class Fit:
         free = len(next(iter(gauge.values()))) if gauge else 0
         return int(self.linear.used.sum()) + priors - unknowns + free
 
-    @cached_property
+    @property
     def leverage(self) -> Array:
         """Diagonal of the hat matrix of the whitened numbers, (n, m): 1 minus the redundancy of each.
 
         A chain without border couples neighbours; its leverage is that of all rows together.
         """
+        return np.diagonal(self.hat, axis1=1, axis2=2)
+
+    @cached_property
+    def hat(self) -> Array:
+        """Hat matrix ``J C J'`` of the whitened numbers of each reading, (n, m, m)."""
         linear, normal = self.linear, self.normal
         n, m = linear.used.shape
-        found = np.zeros((n, m))
+        found = np.zeros((n, m, m))
         b = linear.columns.shape[1]
         root = np.concatenate([normal.root, np.zeros((1, normal.root.shape[1]))])
         # J C J' = J_L own J_L' + E E' with E = (J_B - J_L F) root
@@ -109,25 +114,29 @@ class Fit:
                 index = linear.problem.unknowns[linear.numbering.local].index2[part]
                 E = E + np.einsum("nmwp,nwpr->nmr", linear.local[part], normal.shared[index])
             if np.ndim(E):
-                found[part] += np.einsum("nmr,nmr->nm", E, E)
+                found[part] += E @ np.swapaxes(E, 1, 2)
         if linear.numbering.local is not None:
-            found += self._local_leverage()
+            found += self._local_hat()
         return found
 
-    def _local_leverage(self) -> Array:
+    def _local_hat(self) -> Array:
         linear = self.linear
         block: Block = linear.problem.unknowns[linear.numbering.local]
         index, w = block.index2, linear.local.shape[2]
-        found = np.zeros(linear.used.shape)
+        found = np.zeros((*linear.used.shape, linear.used.shape[1]))
         for i in range(w):
             for j in range(w):
                 C = self.normal.local_covariance(index[:, i], index[:, j])
-                found += np.einsum("nmk,nkl,nml->nm", linear.local[:, :, i], C, linear.local[:, :, j])
+                found += linear.local[:, :, i] @ C @ np.swapaxes(linear.local[:, :, j], 1, 2)
         return found
 
 
 def fit(
-    problem: Problem, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
+    problem: Problem,
+    *,
+    refresh: Callable[[Problem, Any], Problem] | None = None,
+    what: str = "the readings",
+    start: Unknown | None = None,
 ) -> Fit:
     """Return the unknowns that minimise the weighted sum of squares.
 
@@ -139,6 +148,8 @@ def fit(
         frozen quantities (normals, centres, weights) follow the unknowns.
     what : str
         What the readings are, for messages.
+    start : Unknown, optional
+        Where the iteration starts, such as the solution of a similar problem (``Fit.linear.at``).
 
     Raises
     ------
@@ -146,7 +157,7 @@ def fit(
         The readings do not determine the unknowns, which are named; or the iteration has not converged.
     """
     number = Numbering.of(problem)
-    at = problem.start
+    at = problem.start if start is None else start
     last = np.inf
     for _ in range(MAX_ITERATIONS):
         linear = linearised(problem, at, number)

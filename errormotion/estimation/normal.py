@@ -87,6 +87,13 @@ class Normal:
         return np.asarray(self.root @ self.root.T)
 
     @property
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of the normal matrix; with a gauge, of its part that is not 0."""
+        local = -float(np.linalg.slogdet(self._pivots)[1].sum()) if self._pivots.size else 0.0
+        lost = len(self.S) - self.root.shape[1]
+        return local + float(np.log(np.linalg.eigvalsh(self.S)[lost:]).sum())
+
+    @property
     def shared(self) -> Array:
         """Effect of the r independent parts of the border on each local row, (R, p, r)."""
         return np.asarray(-self.F @ self.root)

@@ -143,9 +143,9 @@ class Numbering:
 
     @classmethod
     def of(cls, problem: Problem) -> Numbering:
-        """Return the numbering: the largest block without a group is eliminated."""
+        """Return the numbering: the largest block without a group, and without random effects, is eliminated."""
         counts = [int(block.freed.sum()) for block in problem.unknowns]
-        own = [k for k, block in enumerate(problem.unknowns) if not block.group]
+        own = [k for k, block in enumerate(problem.unknowns) if not block.group and not any(block.component)]
         local = max(own, key=counts.__getitem__, default=None)
         position, border = 0, []
         for k, block in enumerate(problem.unknowns):

@@ -232,6 +232,8 @@ def test_a_chain_has_the_dense_solution(knots: int) -> None:
     assert parts.unknowns.knot == pytest.approx(whole.unknowns.knot, abs=1e-9)
     assert parts.leverage == pytest.approx(whole.leverage, abs=1e-9)
     assert parts.leverage.sum() == pytest.approx(2 * (knots - 1) + 5, rel=1e-9)
+    assert parts.normal.log_determinant == pytest.approx(whole.normal.log_determinant, rel=1e-9)
+    assert whole.normal.log_determinant == pytest.approx(-np.linalg.slogdet(whole.normal.covariance)[1], rel=1e-9)
     C = whole.normal.covariance
     own = parts.normal.own + parts.normal.shared @ np.swapaxes(parts.normal.shared, 1, 2)
     for k in range(1, knots):
@@ -264,6 +266,10 @@ def test_a_vector_reading_with_correlated_noise_has_the_generalised_solution() -
     assert found.unknowns.line[0] == pytest.approx(C @ A.T @ np.linalg.solve(V, b), rel=1e-10)
     assert found.normal.covariance == pytest.approx(C, rel=1e-8)
     assert found.freedom == 21
+    J = found.linear.local[:, :, 0] if found.linear.local.shape[2] else found.linear.border
+    hat = np.einsum("nik,kl,njl->nij", J, C, J)
+    assert found.hat == pytest.approx(hat, abs=1e-9)
+    assert found.leverage.sum() == pytest.approx(2)
 
 
 def test_the_noise_of_a_condition_is_that_of_its_readings() -> None:
@@ -323,3 +329,16 @@ def test_exact_readings_converge() -> None:
         noise=Noise(sd=np.ones(7), stated=False),
     )  # fmt: skip
     assert fit(loose).unknowns.line[0] == pytest.approx([2, 3], abs=1e-14)
+
+
+def test_a_fit_that_starts_at_its_solution_has_the_same_solution() -> None:
+    problem, _, _ = trilateration(30)
+    found = fit(problem)
+    again = fit(problem, start=found.linear.at)
+    assert again.unknowns.target == pytest.approx(found.unknowns.target, abs=1e-13)
+    assert again.chi2 == pytest.approx(found.chi2, rel=1e-12)
+
+
+def test_a_prior_of_zero_is_refused() -> None:
+    with pytest.raises(FitError, match="above 0"):
+        straight(np.linspace(0, 1, 7), np.zeros(7), prior=np.array([1.0, 0.0]))
