@@ -8,7 +8,7 @@ equations of the linearised problem and is halved until Q decreases. The iterati
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -161,7 +161,7 @@ def fit(
     last = np.inf
     for _ in range(MAX_ITERATIONS):
         linear = linearised(problem, at, number)
-        step, decrement = _step(linear, what)
+        normal, step, decrement = _step(linear, what)
         at = _descended(linear, step)
         unit = _unit(linear)
         if refresh is not None:
@@ -174,19 +174,20 @@ def fit(
             f"the fit to {what} has not converged after {MAX_ITERATIONS} iterations (the next step would still "
             f"decrease the sum of squares by {decrement:.2g}). Check units and the order of the readings"
         )
-    linear = linearised(problem, at, number)
-    return Fit(linear, linear.normal()[0])
+    # The derivatives before the last step are those at the solution: it was far below the noise.
+    linear = replace(linear, problem=problem, at=at)
+    return Fit(replace(linear, residual=_whitened(linear)), normal)
 
 
-def _step(linear: Linear, what: str) -> tuple[tuple[Array, Array], float]:
-    """Return the step (R, p), (q,), and the Newton decrement."""
+def _step(linear: Linear, what: str) -> tuple[Normal, tuple[Array, Array], float]:
+    """Return the factorised equations, the step (R, p), (q,), and the Newton decrement."""
     try:
         normal, a, b = linear.normal()
     except SingularError as error:
         raise _undetermined(linear, error, what) from error
     x, z = normal.solve(a[..., None], b[..., None])
     decrement = float(np.vdot(a, x[..., 0]) + b @ z[:, 0])
-    return (x[..., 0], z[:, 0]), decrement
+    return normal, (x[..., 0], z[:, 0]), decrement
 
 
 def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
@@ -203,14 +204,16 @@ def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
 
 def _square(linear: Linear, at: Unknown) -> float:
     """Return the sum of squares at other values of the unknowns, with the weights of the linearisation."""
-    raw = np.where(linear.used, linear.problem.residuals(at), 0.0)
-    r = (linear.whitener @ raw[..., None])[..., 0]
-    moved = Linear(
-        linear.problem, at, linear.numbering, r, linear.used, linear.whitener, linear.local, linear.border,
-        linear.columns,
-    )  # fmt: skip
-    found = moved.chi2 + moved.prior_square()
+    moved = replace(linear, at=at)
+    r = _whitened(moved)
+    found = float(np.vdot(r, r)) + moved.prior_square()
     return found if np.isfinite(found) else np.inf
+
+
+def _whitened(linear: Linear) -> Array:
+    """Return the residuals in units of their noise, (n, m); 0 where missing."""
+    raw = np.where(linear.used, linear.problem.residuals(linear.at), 0.0)
+    return np.asarray((linear.whitener @ raw[..., None])[..., 0])
 
 
 def _unit(linear: Linear) -> float:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
@@ -156,35 +157,55 @@ def _superblocks(band: Sequence[Array], R: int, p: int, s: int, blocks: int) -> 
 
 
 def _eliminated(diagonal: Array, after: Array, s: int, R: int) -> tuple[Array, Array]:
-    """Return the inverse pivots (B, sp, sp), and ``pivot^-1 after`` of each block with a successor."""
+    """Return the inverse pivots (B, sp, sp), and ``pivot^-1 after`` of each block with a successor.
+
+    The unknowns are scaled first, so that T has a diagonal of 1.
+    """
+    size = np.diagonal(diagonal, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(size > 0, size, 1.0))
+    scaled = diagonal * scale[:, :, None] * scale[:, None, :]
     if not after.any():
-        return _inverted(diagonal, np.arange(len(diagonal)), s, R), np.zeros_like(after)
+        inverse, back = _inverted(scaled, s, R), np.zeros_like(after)
+    else:
+        coupling = after * scale[:-1, :, None] * scale[1:, None, :]
+        inverse, back = _chained(scaled, coupling, s, R)
+        back = back * scale[:-1, :, None] / scale[1:, None, :]
+    return inverse * scale[:, :, None] * scale[:, None, :], back
+
+
+def _chained(diagonal: Array, after: Array, s: int, R: int) -> tuple[Array, Array]:
+    """Return the inverse pivots and their products with the coupling, one block after the other."""
     inverse, back = np.empty_like(diagonal), np.empty_like(after)
-    inverse[0] = _inverted(diagonal[:1], np.array([0]), s, R)[0]
-    for k in range(1, len(diagonal)):
-        back[k - 1] = inverse[k - 1] @ after[k - 1]
-        pivot = diagonal[k] - after[k - 1].T @ back[k - 1]
-        inverse[k] = _inverted(pivot[None], np.array([k]), s, R)[0]
+    pivot = diagonal[0]
+    for k in range(len(diagonal)):
+        factor, failed = lapack.dpotrf(pivot, lower=1)
+        if failed or np.square(np.diagonal(factor)).min(initial=1.0) <= SINGULAR:
+            raise _singular(np.array([k]), s, R)
+        half = lapack.dpotri(factor, lower=1)[0]
+        inverse[k] = np.tril(half) + np.tril(half, -1).T
+        if k < len(after):
+            back[k] = inverse[k] @ after[k]
+            pivot = diagonal[k + 1] - after[k].T @ back[k]
     return inverse, back
 
 
-def _inverted(matrices: Array, number: Index, s: int, R: int) -> Array:
-    """Return inverses of symmetric matrices, scaled to a diagonal of 1 first; singular ones raise an error."""
-    diagonal = np.diagonal(matrices, axis1=1, axis2=2)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = matrices * scale[:, :, None] * scale[:, None, :]
+def _inverted(matrices: Array, s: int, R: int) -> Array:
+    """Return inverses of symmetric matrices with a diagonal of 1; singular ones raise an error."""
     try:
-        root = np.linalg.cholesky(scaled)
-        smallest = np.diagonal(root, axis1=1, axis2=2) ** 2
+        smallest = np.square(np.diagonal(np.linalg.cholesky(matrices), axis1=1, axis2=2))
     except np.linalg.LinAlgError:
-        smallest = np.linalg.eigvalsh(scaled)
+        smallest = np.linalg.eigvalsh(matrices)
     bad = np.flatnonzero(smallest.min(axis=1, initial=1.0) <= SINGULAR)
     if bad.size:
-        rows = np.concatenate([number[k] * s + np.arange(s) for k in bad])
-        raise SingularError(rows[rows < R], np.zeros(0, dtype=int))
-    found = np.linalg.inv(scaled)
-    found = (found + np.swapaxes(found, 1, 2)) / 2
-    return np.asarray(found * scale[:, :, None] * scale[:, None, :])
+        raise _singular(bad, s, R)
+    found = np.linalg.inv(matrices)
+    return np.asarray((found + np.swapaxes(found, 1, 2)) / 2)
+
+
+def _singular(blocks: Index, s: int, R: int) -> SingularError:
+    """Return the error that names the rows of blocks of s rows."""
+    rows = (blocks[:, None] * s + np.arange(s)).ravel()
+    return SingularError(rows[rows < R], np.zeros(0, dtype=int))
 
 
 def _inverses(pivots: Array, back: Array) -> Array:
