@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from errormotion.datasets.results.extremes import expanded
 from errormotion.datasets.results.merit import is_planned
+from errormotion.estimation.extremes import expanded
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.methods.linear_positioning.settings import LIMITS
 from errormotion.plugins import FigureOfMerit

@@ -16,17 +16,11 @@ offset of the centre, is removed by the least-squares circle. The figures confor
 ``D``
     Mean bi-directional radial deviation: radius of the least-squares circle of both paths, minus the nominal radius.
 
-A maximum of noisy values is too large on average, by an amount that depends on the shape of the path. SIMEX (Cook,
-Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314) estimates it from the path: noise of the same size is added once more,
-which increases a figure from g_0 to g_1 = g_0 + d on average. The bias is proportional to the standard deviation of the
-noise for a path that is flat about its extremes, and to its variance for a pointed one. Extrapolation to zero noise::
-
-    flat      g = g_0 - d / (sqrt(2) - 1)
-    pointed   g = g_0 - d
-
-The value is the first, without bias on flat paths. The standard uncertainty combines the standard deviation of the
-figure under noise with the difference of the two as standard uncertainty of the extrapolation: intervals of two
-standard uncertainties then contain the true figure in about 95 % of tests, on flat and on pointed paths.
+A maximum of noisy values is too large on average, by an amount that depends on the shape of the path;
+`errormotion.estimation.extremes` estimates it from the path, by noise that is added once more. The value is corrected
+for the bias of a path that is flat about its extremes. The standard uncertainty combines the standard deviation of the
+figure under noise with the difference from the bias of a pointed path: intervals of two standard uncertainties then
+contain the true figure in about 95 % of tests, on flat and on pointed paths.
 """
 
 from dataclasses import dataclass
@@ -34,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballbar_test.path import circle, middles
-from errormotion.datasets.results.extremes import FLAT
+from errormotion.estimation.extremes import FLAT, POINTED, of_noisy_values
 
 NAMES = ("G(CCW)", "G(CW)", "G(b)", "H", "Fmax", "Fmin", "D")
 MEANINGS = (
@@ -48,8 +42,6 @@ MEANINGS = (
 )
 POSITIVE = ("G(CCW)", "G(CW)", "G(b)", "H")
 DRAWS = 200
-POINTED = 1.0
-"""Ratio of the bias of a figure to its change by additional noise of the same size, for pointed paths."""
 
 
 @dataclass(frozen=True)
@@ -118,20 +110,19 @@ def figures(deviation, independent, shared, shape=None):
     """
     shape = np.zeros(deviation.shape) if shape is None else shape
     parts = shape.shape[-1] // deviation.shape[-1]
-    draw = np.random.default_rng(0).standard_normal
-    half = independent * draw((DRAWS // 2, *deviation.shape))
-    half += np.tensordot(draw((DRAWS // 2, len(shared))), shared, axes=1)
 
-    def path(values):
-        return np.repeat(values, parts, axis=-1) + shape
+    def of_path(values):
+        return evaluate(np.repeat(values, parts, axis=-1) + shape)
 
-    first = evaluate(path(deviation))
-    again = evaluate(path(deviation + np.concatenate([half, -half])))  # in pairs, so that the draws cause no bias
-    d = again.mean(axis=0) - first
-    value = first - FLAT * d
-    covariance = np.cov(again.T)
-    tail = np.abs(np.quantile(again, (0.025, 0.975), axis=0) - again.mean(axis=0)).max(axis=0) / 2
-    skewed = np.maximum(tail**2 - np.diagonal(covariance), 0.0)
-    covariance += np.diag(skewed + ((FLAT - POINTED) * d) ** 2)
-    positive = np.isin(NAMES, POSITIVE)
-    return Figures(np.where(positive, np.maximum(value, 0.0), value), covariance)
+    found = of_noisy_values(
+        of_path,
+        deviation,
+        independent,
+        shared,
+        draws=DRAWS,
+        seed=0,
+        bias_uncertainty=(FLAT - POINTED) / FLAT,
+        skewed=True,
+    )
+    value = found.value - found.bias
+    return Figures(np.where(np.isin(NAMES, POSITIVE), np.maximum(value, 0.0), value), found.covariance)

@@ -5,11 +5,8 @@ average. The true figure is that of the true means and standard deviations, the 
 Its distribution given the readings is found by simulation (JCGM 101). In each trial
 
 * variances are drawn from their scaled inverse chi-square distributions;
-* the mean curve is a line plus a remainder r. The observed remainder contains noise of variance s^2, so the variance
-  t^2 of the true one is that of the observed remainder less s^2, and the true remainder of a target has the mean
-  ``B r_i`` and the variance ``B s^2`` with ``B = t^2 / (t^2 + s^2)`` (Efron, Morris, J. Am. Stat. Assoc. 68 (1973)
-  117). The reversal curve, and the logarithms of variances that differ from target to target, are treated in the same
-  way;
+* the mean curve and the reversal curve are drawn as a line plus a remainder that is shrunk by the share of noise in it
+  (`errormotion.estimation.true_curves`), as are the logarithms of variances that differ from target to target;
 * drift from run to run shifts and inclines both curves, and each source of the budget is drawn once.
 
 The figure of the standard exceeds the median of the trials by the ``bias``. The bias depends on the assumption of how
@@ -20,17 +17,16 @@ uncertainty (root sum of squares). The mean reversal error is not an extreme val
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from scipy import special
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.extremes import BIAS_UNCERTAINTY, SEED, Extremes
+from errormotion.estimation.extremes import SEED, Extremes, by_true_values
+from errormotion.estimation.true_curves import draw_components, draw_curves, draw_variances
 from errormotion.methods.linear_positioning.identification import standard
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import Statistics
-
-SIGNIFICANT = 0.01
-"""Probability below which a variance of the drift is significantly different from 0."""
 
 
 def straightened(statistics: Statistics, z: Array) -> Statistics:
@@ -68,13 +64,14 @@ def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straig
     value = _evaluate(observed, spread.z, straight)
     if not trials:
         return Extremes(value, *np.full((2, value.size), np.nan))
-    true = _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight)
-    bias = value - np.median(true, axis=0)
-    u = np.hypot(true.std(axis=0, ddof=1), BIAS_UNCERTAINTY * bias)
+    found = by_true_values(value, _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight))
     mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
-    if np.isfinite(value[mean]):
-        bias[mean], u[mean] = 0.0, _mean_reversal_u(x, spread)
-    return Extremes(value, bias, u)
+    if not np.isfinite(value[mean]):
+        return found
+    others = np.arange(value.size) != mean
+    return replace(
+        found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, _mean_reversal_u(x, spread))
+    )
 
 
 def _mean_reversal_u(x: Array, spread: Scatter) -> float:
@@ -99,8 +96,12 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
     n = np.isfinite(x).sum(axis=1)
     measured = n.any(axis=1)
     both = bool(measured.all())
-    own = _own(spread, trials, generator)  # (trial, approach, target)
-    common, opposite = _drifts(spread, trials, generator)  # (trial, 2)
+    freedom = 2.0 * spread.own_factor / (spread.own_factor - 1.0) if spread.own_factor > 1.0 else np.inf
+    own = draw_variances(spread.own, freedom, trials, generator, common=spread.pooled)  # (trial, approach, target)
+    common, opposite = (
+        draw_components(variance, spread.noise, spread.freedom, trials, generator)  # (trial, 2)
+        for variance in (spread.common, spread.opposite)
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         of_mean = own / n
     if both:
@@ -111,7 +112,7 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
         noise = of_mean[:, int(measured.argmax())]
     runs = max(int(n.max()), 1)
     drawn = [
-        _curve(curve, noise, drift / runs, z, about_zero=k > 0, generator=generator)
+        draw_curves(curve, noise, drift / runs, z, about_zero=k > 0, generator=generator)
         for k, (curve, drift) in enumerate(zip(curves, (common, opposite), strict=False))
     ]
     of_sources = draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
@@ -122,7 +123,7 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
         single = (n > 0) & ~(n > 0).all(axis=0)  # targets that were reached by this approach only
         for approach in np.flatnonzero(single.any(axis=1)):
             of_runs = (common + opposite) / runs
-            alone = _curve(
+            alone = draw_curves(
                 observed.mean[approach], of_mean[:, approach], of_runs, z, about_zero=False, generator=generator
             )
             mean[:, approach, single[approach]] = (alone + of_sources)[:, single[approach]]
@@ -130,79 +131,3 @@ def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, targ
         mean[:, int(measured.argmax())] = drawn[0]
     total = own + ((common + opposite) @ np.stack([np.ones_like(z), z**2]))[:, None, :]
     return Statistics(mean, np.sqrt(total))
-
-
-def _own(spread: Scatter, trials: int, generator: np.random.Generator) -> Array:
-    """Return draws of the variances of one reading, (trial, approach, target)."""
-    known = np.isfinite(spread.own)
-    freedom = 2.0 * spread.own_factor / (spread.own_factor - 1.0) if spread.own_factor > 1.0 else np.inf
-    if spread.pooled:
-        scale = freedom / generator.chisquare(freedom, trials) if np.isfinite(freedom) else np.ones(trials)
-        return np.asarray(scale[:, None, None] * spread.own)
-    logs = np.log(spread.own[known]) - special.digamma(freedom / 2.0) + np.log(freedom / 2.0)
-    noise = float(special.polygamma(1, freedom / 2.0))
-    centre, width = logs.mean(), logs.var(ddof=1)
-    B = max(0.0, 1.0 - noise / width) if width > 0 else 0.0
-    drawn = np.full((trials, *spread.own.shape), np.nan)
-    shrunk = centre + B * (logs - centre)
-    drawn[:, known] = np.exp(shrunk + np.sqrt(B * noise) * generator.standard_normal((trials, logs.size)))
-    return drawn
-
-
-def _drifts(spread: Scatter, trials: int, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return draws of the variances of offset and slope of a run, common and opposite, each (trial, 2).
-
-    A variance that does not differ significantly from 0 is not drawn: its distribution would be that of the noise.
-    """
-    drawn = []
-    for variance in (spread.common, spread.opposite):
-        variances = np.tile(variance, (trials, 1))
-        if spread.freedom > 0:
-            with np.errstate(invalid="ignore", divide="ignore"):
-                ratio = (variance + spread.noise) / spread.noise
-            significant = special.chdtrc(spread.freedom, spread.freedom * ratio) < SIGNIFICANT
-            scale = spread.freedom / generator.chisquare(spread.freedom, (trials, 2))
-            with_noise = np.maximum(scale * (variance + spread.noise) - spread.noise, 0.0)
-            variances = np.where(significant, with_noise, variances)
-        drawn.append(variances)
-    return drawn[0], drawn[1]
-
-
-def _curve(
-    curve: Array, noise: Array, drift: Array, z: Array, *, about_zero: bool, generator: np.random.Generator
-) -> Array:
-    """Return draws of the true curve (trial, target), given an observed one.
-
-    ``noise`` (trial, target) is the variance that is independent from target to target, ``drift`` (trial, 2) that of
-    offset and slope. Offset and slope of a curve ``about_zero``, such as a reversal, are shrunk towards 0 like the
-    remainder, with one degree of freedom each.
-    """
-    known = np.isfinite(curve)
-    m, trials = int(known.sum()), len(noise)
-    if m < 2:  # no line
-        out = np.full((trials, z.size), np.nan)
-        spread = np.sqrt(noise[:, known] + drift[:, :1])
-        out[:, known] = curve[known] + spread * generator.standard_normal((trials, m))
-        return out
-    Z = np.stack([np.ones(m), z[known]], axis=1)
-    normal = np.linalg.inv(Z.T @ Z)
-    coefficient = normal @ Z.T @ curve[known]
-    rest = curve[known] - Z @ coefficient
-    variance = noise[:, known]
-    typical = variance.mean(axis=1)
-    of_line = typical[:, None] * np.diagonal(normal) + drift
-    B = _share(coefficient**2 / generator.chisquare(1.0, (trials, 2)), of_line)
-    if not about_zero:
-        B[:] = 1.0
-    line = B * coefficient + np.sqrt(B * of_line) * generator.standard_normal((trials, 2))
-    B = _share(float(rest @ rest) / generator.chisquare(max(m - 2, 1), trials), typical)[:, None]
-    remainder = B * rest + np.sqrt(B * variance) * generator.standard_normal((trials, m))
-    out = np.full((trials, z.size), np.nan)
-    out[:, known] = line @ Z.T + remainder
-    return out
-
-
-def _share(observed: Array, noise: Array) -> Array:
-    """Return the share of an observed variance that is not noise."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(observed > noise, 1.0 - noise / observed, 0.0)

@@ -11,8 +11,8 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.certificates import certified
-from errormotion.datasets.results.extremes import Extremes
 from errormotion.datasets.timing import start_of
+from errormotion.estimation.extremes import Extremes
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.methods.linear_positioning.identification import budget, extremes, standard
 from errormotion.methods.linear_positioning.identification.expansion import Shared, expansion

@@ -4,7 +4,7 @@ The errors are the deviations minus their mean in the cold state. The noise of a
 over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. Ranges are those of
 single readings, and of the value after exactly 60 min, between two readings: a mean over cycles lags behind the drift.
 A range of noisy readings is too large; its mean excess is stated as bias, and is contained in its uncertainty
-(`errormotion.datasets.results.extremes`).
+(`errormotion.estimation.extremes`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.certificates import certified
-from errormotion.datasets.results.extremes import expanded, range_from_reference
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
+from errormotion.estimation.extremes import expanded, range_from_reference
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
 from errormotion.methods.linear_positioning.identification.budget import assumed_length
 from errormotion.methods.linear_positioning.identification.reading import (

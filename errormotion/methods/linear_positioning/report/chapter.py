@@ -7,7 +7,7 @@ import math
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets.results.extremes import expanded
+from errormotion.estimation.extremes import expanded
 from errormotion.methods.linear_positioning.figures import ALIGNED_FIGURES
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.report import drawings

@@ -4,7 +4,7 @@ Seven quantities: the axis displacement at the two levels (X1, Y1 at L1, X2, Y2 
 each, the range over an interval and the difference between its end and its start; the name states which, because the
 two differ for a curve that is not monotonic. Ranges are taken over means of half a minute and the value at the end of
 the interval, that of a line through the last half minute. A range of noisy values is too large; its mean excess is
-stated as bias, and is contained in its uncertainty (`errormotion.datasets.results.extremes`). No mean reaches beyond
+stated as bias, and is contained in its uncertainty (`errormotion.estimation.extremes`). No mean reaches beyond
 the end of an interval.
 """
 
@@ -17,9 +17,9 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.extremes import expanded, range_from_reference
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
+from errormotion.estimation.extremes import expanded, range_from_reference
 from errormotion.methods.spindle_drift.identification.record import turns
 
 if TYPE_CHECKING:

@@ -1,0 +1,147 @@
+"""Figures that are extreme values of noisy curves: their mean excess by noise, and their uncertainty.
+
+The largest of noisy values is too large on average, and the range of a curve at rest is that of its noise. Standards do
+not correct for this ``bias``. Two estimates of it:
+
+`of_noisy_values`, by added noise
+    For any curve. Noise of the same size is added once more, which increases a figure by d on average (SIMEX: Cook,
+    Stefanski, J. Am. Stat. Assoc. 89 (1994) 1314). The bias of a curve that is flat about its extremes is proportional
+    to the standard deviation of the noise, so that it is ``d / (sqrt(2) - 1)``; that of a curve with pointed extremes
+    is proportional to the variance, so that it is d. The first is stated.
+`by_true_values`, by draws of the true values
+    For curves whose departures from a line are alike at all positions, for which `errormotion.estimation.true_curves`
+    draws the true curve given the readings. The bias is the excess over the median of the figures of these draws.
+
+A bias depends on assumptions about the curve. Half of it is added to the standard deviation of the figure as its
+standard uncertainty (root sum of squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from errormotion.arrays import Array
+
+SEED = 230
+DRAWS = 300
+BIAS_UNCERTAINTY = 0.5
+"""Standard uncertainty of a bias, relative to it."""
+FLAT = 1.0 / (np.sqrt(2.0) - 1.0)
+"""Ratio of the bias of a figure to its change by additional noise of the same size, for flat curves."""
+POINTED = 1.0
+"""The same ratio for curves with pointed extremes."""
+_VALUES = 1_000_000
+"""Largest number of simulated values; fewer draws are made for longer curves."""
+_FEWEST = 100
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """Figures that are extreme values, or one of them; NaN = unknown.
+
+    Attributes
+    ----------
+    value : ndarray, (figure,) or ()
+        Of the measured values.
+    bias : ndarray, (figure,) or ()
+        Typical excess over the true figure.
+    u : ndarray, (figure,) or ()
+        Standard uncertainty of ``value - bias``.
+    covariance : ndarray, (figure, figure) or (), optional
+        Covariance of ``value - bias``, of figures of noisy values.
+    """
+
+    value: Array
+    bias: Array
+    u: Array
+    covariance: Array | None = None
+
+
+def expanded(bias: Array | float, u: Array | float) -> Array:
+    """Return the expanded uncertainty (k = 2) of a value that is not corrected for its bias (JCGM 100, F.2.4.5)."""
+    return np.asarray(2.0 * np.asarray(u) + np.abs(bias))
+
+
+def of_noisy_values(
+    figures: Callable[[Array], Array],
+    values: Array,
+    independent: Array,
+    shared: Array,
+    *,
+    draws: int | None = None,
+    seed: int = SEED,
+    bias_uncertainty: float = BIAS_UNCERTAINTY,
+    skewed: bool = False,
+) -> Extremes:
+    """Return figures of measured values with their bias and uncertainty, by noise that is added once more.
+
+    State ``value - bias`` with u, or value with `expanded`.
+
+    Parameters
+    ----------
+    figures : callable
+        From values (..., *shape) to figures (...) or (..., figure).
+    values : ndarray, (*shape,)
+        Measured, in any unit.
+    independent : ndarray, (*shape,)
+        Standard uncertainty that is independent from value to value.
+    shared : ndarray, (source, *shape)
+        Effect of one standard uncertainty of each source that the values share.
+    draws : int, optional
+        Number of simulations; default: `DRAWS`, fewer for more than 3000 values.
+    seed : int
+        Of the simulated noise; the result is the same in each call.
+    bias_uncertainty : float
+        Standard uncertainty of a bias, relative to it.
+    skewed : bool
+        Whether u is increased to half of the 95 % deviation on the longer side, where that is larger.
+    """
+    if draws is None:
+        draws = int(np.clip(_VALUES // max(values.size, 1), _FEWEST, DRAWS))
+    draw = np.random.default_rng(seed).standard_normal
+    half = independent * draw((draws // 2, *values.shape))
+    half += np.tensordot(draw((draws // 2, len(shared))), shared, axes=1)
+    first = figures(values)
+    again = figures(values + np.concatenate([half, -half]))  # in pairs, so that the draws cause no bias
+    mean, deviation = again.mean(axis=0), again.std(axis=0, ddof=1)
+    bias = FLAT * (mean - first)
+    extra = np.square(bias_uncertainty * bias)
+    if skewed:
+        tail = np.abs(np.quantile(again, (0.025, 0.975), axis=0) - mean).max(axis=0) / 2.0
+        extra = extra + np.maximum(tail**2 - deviation**2, 0.0)
+    covariance = np.cov(again.T) + (np.diag(extra) if extra.ndim else extra)
+    return Extremes(first, bias, np.hypot(deviation, np.sqrt(extra)), covariance)
+
+
+def range_from_reference(values: Array, variance: Array, shared: Array) -> Extremes:
+    """Return the range of a curve and of its reference state, whose value is 0 by definition.
+
+    Parameters
+    ----------
+    values, variance : ndarray, (n,)
+        Values and the variance that is independent from value to value.
+    shared : ndarray, (source, n)
+        Effect of one standard uncertainty of each source that the values share.
+    """
+    return of_noisy_values(_range, values, np.sqrt(variance), shared)
+
+
+def by_true_values(value: Array, true: Array) -> Extremes:
+    """Return figures with their bias and uncertainty, by the figures of draws of the true values.
+
+    Parameters
+    ----------
+    value : ndarray, (figure,)
+        Figures of the measured values; NaN is unknown.
+    true : ndarray, (trial, figure)
+        Figures of draws of the true values, given the measured ones.
+    """
+    bias = value - np.median(true, axis=0)
+    return Extremes(value, bias, np.hypot(true.std(axis=0, ddof=1), BIAS_UNCERTAINTY * bias))
+
+
+def _range(values: Array) -> Array:
+    return np.asarray(np.maximum(values.max(axis=-1), 0.0) - np.minimum(values.min(axis=-1), 0.0))
