@@ -20,7 +20,7 @@ from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.identification.smoothing import ORDER, smooth
+from errormotion.estimation.smoothing import ORDER, smooth
 
 #: Smallest number of artefacts that can be compared with each other.
 MINIMUM_ARTEFACTS = 4

@@ -1,7 +1,19 @@
 """Smooth curves of the axis errors over position and over time.
 
-The curves are fitted in the profiler's frame, where displacements do not contain the rotations times the lever. They
-are then transformed to the carriage like the points, with the contributions of pose and lever.
+The curves are fitted in the profiler's frame, where displacements do not contain the rotations times the lever: over
+the lever of 2 m, the noise of the rotations would dominate that of the displacements. They are then transformed to the
+carriage like the points, with the contributions of pose and lever. Errors that all points share (pose of the profiler,
+lever, cold scan) are not reduced by smoothing.
+
+Reasons for the choices (`errormotion.estimation.smoothing`), from the virtual gantry (eight positions, nine times, each
+point predicted from the others):
+
+* Order 3 predicts the omitted point far better than order 2, with half the uncertainty. A beam in a smooth temperature
+  field has a continuous curvature, as order 3 has and order 2 does not.
+* One amplitude for all cycles of a freedom is as good as one for each cycle, or one in proportion to the errors of the
+  cycle, with a ninth of the parameters: the cycles share the shape of the guide.
+* On a linear scale of time, the curves bend most at the beginning, where their uncertainty would be too small. On
+  ``warm_up_scale``, exponentials with time constants from 15 min to 2 h are about equally smooth.
 """
 
 from __future__ import annotations
@@ -9,16 +21,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
+from errormotion.estimation.smoothing import smooth_vectors
 from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig
 from errormotion.methods.crossbeam_scan.identification.chain import CarriageErrors, carriage_errors
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
-from errormotion.methods.crossbeam_scan.identification.smoothing import smooth_twists, warm_up_scale
 
 PLACES, MOMENTS = 41, 41
 """Number of points of a curve over position and over time."""
+LINEAR_TIME = 1500.0
+"""Time at which the scale of time changes from linear to logarithmic, s."""
+
+
+def warm_up_scale(time: ArrayLike) -> Array:
+    """Return log(1 + t / 25 min) of times t (s): the scale on which the errors of a warm-up are equally smooth."""
+    return np.log1p(np.asarray(time, dtype=float) / LINEAR_TIME)
 
 
 def curves(
@@ -55,7 +74,7 @@ def curves(
     e = np.where(wrong[warm][..., None], np.nan, axis.profiler[warm])
     C = axis.profiler_covariance[warm]
     place = np.linspace(positions[0], positions[-1], PLACES) if positions.size > 1 else positions.copy()
-    over = smooth_twists(positions, e, C, place)
+    over = smooth_vectors(positions, e, C, place)
     position, position_u = _chained(over.values, over.covariance, rig)
     cold = np.zeros((1, *position.shape[1:]))
 
@@ -63,7 +82,7 @@ def curves(
     share = found.cold_share[warm]
     e, C, share = (np.swapaxes(value, 0, 1) for value in (e, C, share))  # artefact, cycle
     own = C * (1 - share)[..., None, None]
-    along = smooth_twists(warm_up_scale(time), e, own, warm_up_scale(moment), exact_zero=True)
+    along = smooth_vectors(warm_up_scale(time), e, own, warm_up_scale(moment), exact_zero=True)
     common = np.linalg.cholesky(_regularised(C * share[..., None, None]))  # one draw for all cycles of an artefact
     effect = along.carry(np.moveaxis(common, -1, 0))  # (6, artefact, moment, 6)
     total = along.covariance + np.einsum("s...i,s...j->...ij", effect, effect)
