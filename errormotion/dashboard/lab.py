@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
+from errormotion.dashboard.cache import Cache, stamp
+from errormotion.datasets.files import events
 from errormotion.datasets.files.reading import leaves
 from errormotion.datasets.files.runfile import FILE
 from errormotion.errors import RunError
@@ -19,6 +21,8 @@ from errormotion.report.text import DASH, rounded, signs
 
 MAX_KEY = 600
 """Longest key of a run, characters."""
+MAX_ENTRIES = 64
+"""Number of entries of runs that are kept, for the pages of one run."""
 FILES = {"report": "report.html", "pdf": "report.pdf", "xlsx": "report.xlsx", "run": FILE, "log": "log.jsonl"}
 """Files of a run folder that can be downloaded, by keyword; the keyword ``errors`` is the error dataset."""
 
@@ -74,6 +78,7 @@ class Lab:
     """A folder of runs."""
 
     runs: Path
+    _entries: Cache[Entry] = field(default_factory=lambda: Cache(MAX_ENTRIES), compare=False)
 
     def table(self, choice: Choice) -> Table:
         """Return the runs of a selection.
@@ -125,7 +130,7 @@ class Lab:
         RunError
             The run does not exist, or its ``run.json`` cannot be read.
         """
-        return read_entry(self.folder(key))
+        return self._entry(self.folder(key))
 
     def file(self, key: str, word: str) -> Path:
         """Return a file of a run by its keyword: a key of `FILES`, or ``errors``.
@@ -136,21 +141,31 @@ class Lab:
             The run or the file does not exist, or a link leads out of the folder.
         """
         folder = self.folder(key)
-        name = read_entry(folder).errors if word == "errors" else FILES.get(word, "")
+        name = self._entry(folder).errors if word == "errors" else FILES.get(word, "")
         if name and _inside(folder / name, folder):
             return folder / name
         raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.")
 
-    def files(self, key: str) -> tuple[str, ...]:
-        """Return the keywords of the files of a run."""
-        found = []
-        for word in (*FILES, "errors"):
-            try:
-                self.file(key, word)
-            except RunError:
-                continue
-            found.append(word)
-        return tuple(found)
+    def run(self, key: str) -> tuple[Entry, tuple[str, ...]]:
+        """Return the entry of a run, and the keywords of its files.
+
+        Raises
+        ------
+        RunError
+            As `entry`.
+        """
+        folder = self.folder(key)
+        entry = self._entry(folder)
+        names = {**FILES, "errors": entry.errors}
+        return entry, tuple(word for word, name in names.items() if name and _inside(folder / name, folder))
+
+    def _entry(self, folder: Path) -> Entry:
+        """Return the entry of a folder, read again only after a change of its files."""
+        try:
+            key = tuple(stamp(folder / name) for name in (FILE, events.FILE) if (folder / name).is_file())
+        except OSError:
+            key = ()
+        return self._entries.get(key, lambda: read_entry(folder)) if key else read_entry(folder)
 
 
 def figure_text(figure: FigureOfMerit) -> tuple[str, str, str]:

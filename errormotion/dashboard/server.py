@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import ssl
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 from bokeh.util.paths import bokehjs_path
 from tornado.httputil import HTTPHeaders, parse_cookie
-from tornado.netutil import bind_sockets
-from tornado.web import Application, HTTPError, StaticFileHandler
+from tornado.web import Application, HTTPError
 
 from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
-from errormotion.dashboard.door import Door, Server
+from errormotion.dashboard.door import Door, Server, listeners
 from errormotion.dashboard.lab import Lab
 from errormotion.dashboard.pages import compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
@@ -31,6 +32,8 @@ PAGES = (("/measure", "Measure"), ("/results", "Results"), ("/compare", "Compare
 BOKEH = ("bokeh.min.js",)
 """Scripts of bokeh that pages load."""
 LOGIN = "/login"
+TYPES = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8", ".svg": "image/svg+xml"}
+"""Types of static files, by ending."""
 WORKERS = 4
 """Number of threads for fast functions."""
 SLOW_WORKERS = 2
@@ -74,26 +77,39 @@ class Start(Guarded):
 class Missing(Guarded):
     """Any unknown address."""
 
-    def prepare(self) -> None:
+    async def prepare(self) -> None:
         """Refuse the request, after the check of access."""
-        super().prepare()
+        await super().prepare()
         if not self._finished:
             raise HTTPError(404, reason="No such page")
 
 
-class Static(Guarded, StaticFileHandler):
-    """Style, scripts and BokehJS, from the packages."""
+class Static(Guarded):
+    """Style, scripts and BokehJS, from the packages; each is read and compressed once."""
 
     public = True
 
     def initialize(self, context: Context, path: str) -> None:  # type: ignore[override]
         """Set the context of the server and the folder."""
-        Guarded.initialize(self, context)
-        StaticFileHandler.initialize(self, path)
+        super().initialize(context)
+        self._folder = Path(path)
 
-    def set_extra_headers(self, path: str) -> None:  # noqa: ARG002 - as tornado calls it
-        """Allow browsers to cache the file if they check for changes."""
+    async def get(self, name: str) -> None:
+        """Send the file; browsers may cache it if they check for changes."""
+        as_gzip = "gzip" in self.request.headers.get("Accept-Encoding", "")
+        content = await self.in_state_thread(_static, self._folder / name, as_gzip)
         self.set_header("Cache-Control", "no-cache")
+        self.set_header("Vary", "Accept-Encoding")
+        self.set_header("Content-Type", TYPES[Path(name).suffix])
+        if as_gzip:
+            self.set_header("Content-Encoding", "gzip")
+        self.finish(content)
+
+
+@cache
+def _static(path: Path, as_gzip: bool) -> bytes:
+    content = path.read_bytes()
+    return gzip.compress(content) if as_gzip else content
 
 
 def application(context: Context) -> Application:
@@ -174,7 +190,7 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         ThreadPoolExecutor(SLOW_WORKERS, thread_name_prefix="errormotion-dashboard-slow") as slow,
     ):
         try:
-            sockets = bind_sockets(options.port, options.host)
+            sockets = listeners(options.port, options.host)
         except OSError as error:
             raise RunError(
                 f"{options.host}, port {options.port}: the server cannot listen: {error.strerror}"

@@ -259,11 +259,15 @@ def test_the_budget_closes_the_longest_idle_stranger_first() -> None:
     budget, streams = Budget(most=4), [_Stream() for _ in range(8)]
     made: list[Any] = list(streams)
     assert all(budget.arrive(each) for each in made[:4])
+    assert not budget.arrive(made[4])  # the first requests of the others are still due
+    for each in made[:4]:
+        budget.settle(each)
     budget.begin(made[0], trusted=True)
     budget.end(made[0])  # a known client, idle
     budget.begin(made[1], trusted=False)  # a request in progress
     assert budget.arrive(made[4])
     assert [each.ended for each in streams[:5]] == [False, False, True, False, False]
+    budget.settle(made[4])
     assert budget.arrive(made[5])
     assert budget.arrive(made[6])
     assert [each.ended for each in streams[:7]] == [False, False, True, True, True, False, False]

@@ -56,7 +56,7 @@ def test_a_key_cannot_leave_the_folder(lab: Lab, runs: Path, key: str) -> None:
 
 
 def test_only_named_files_inside_the_folder_are_served(tmp_path: Path, lab: Lab, key: str) -> None:
-    assert set(lab.files(key)) == {"report", "run", "log", "errors"}
+    assert set(lab.run(key)[1]) == {"report", "run", "log", "errors"}
     assert lab.file(key, "errors").name == "errors.nc"
     for word in ("errors.nc", "../run.json", "", "raw"):
         with pytest.raises(RunError, match="has no file"):
@@ -67,4 +67,4 @@ def test_only_named_files_inside_the_folder_are_served(tmp_path: Path, lab: Lab,
     (tmp_path / "secret.nc").write_text("x")
     (run / "secret.nc").symlink_to(tmp_path / "secret.nc")
     (run / "report.html").symlink_to(tmp_path / "secret.nc")
-    assert Lab(tmp_path / "runs").files("linked") == ("run",)
+    assert Lab(tmp_path / "runs").run("linked")[1] == ("run",)

@@ -185,14 +185,31 @@ def test_a_file_that_may_change_within_its_time_stamp_is_not_indexed(tmp_path: P
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", '{"schema": "errormotion.index/1", "runs": [3, {"folder": "run-00000"}]}', "[" * 100000],
+    [
+        "",
+        "{",
+        "[]",
+        '{"schema": "errormotion.index/1", "runs": [3, {"folder": "run-00000"}]}',
+        '{"schema": "errormotion.index/2"}\n3\n{"folder": "run-00000"}\n{',
+        '{"schema": "errormotion.index/2"}\n' + 2 * ("[" * 100000 + "\n"),
+        "[" * 100000,
+    ],
 )
 def test_a_damaged_index_changes_nothing(tmp_path: Path, text: str) -> None:
     make(tmp_path, 0)
     expected = listing.list_runs([tmp_path]).runs
     (tmp_path / index.FILE).write_text(text)
     assert listing.list_runs([tmp_path]).runs == expected
-    assert json.loads((tmp_path / index.FILE).read_text())["runs"][0]["folder"] == "run-00000"
+    _, line = (tmp_path / index.FILE).read_text().splitlines()
+    assert json.loads(line)["folder"] == "run-00000"
+
+
+def test_a_long_line_of_an_index_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make(tmp_path, 0)
+    listing.list_runs([tmp_path])
+    assert list(index.load(tmp_path)) == ["run-00000"]
+    monkeypatch.setattr(index, "MAX_LINE", 50)
+    assert index.load(tmp_path) == {}
 
 
 def test_a_folder_that_cannot_be_written_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -91,7 +91,7 @@ class Compare(_Comparing):
                 await self.in_slow_thread(_history_of, self.context.lab.runs, *requested.values())
         except ErrormotionError as error:
             wrong_history = str(error)
-        self.show(
+        await self.show(
             "compare.html.j2",
             table=table,
             rows=[row for row in table.rows if row.method][:MAX_LISTED],
@@ -119,7 +119,7 @@ class Figure(_Comparing):
     async def get(self) -> None:
         """Send the figure."""
         found = await self.in_slow_thread(_compared, self.context.lab, self.selection())
-        self.finish({"item": await self.in_thread(comparison_item, found)})
+        await self.send({"item": await self.in_thread(comparison_item, found)})
 
 
 class Report(_Comparing):

@@ -46,6 +46,8 @@ class _Compensating(Guarded):
 class Compensate(_Compensating):
     """The page; `State` and `Curves` provide its values."""
 
+    share = "stopping"
+
     async def get(self) -> None:
         """Send the page without values; it has the stop buttons, and waits for benches and models a short time only."""
         known, read = self.compensations, True
@@ -57,7 +59,7 @@ class Compensate(_Compensating):
                 benches, models = await asyncio.wait_for(found, LISTS_TIMEOUT)
             except (TimeoutError, HTTPError):
                 read = False
-        self.show(
+        await self.show(
             "compensate.html.j2",
             control=self.context.control,
             runs=known.runs,
@@ -90,7 +92,7 @@ class Begin(_Compensating):
 class Stop(_Compensating):
     """Request to a compensation to ramp to zero and end."""
 
-    controls = True
+    controls = stops = True
 
     async def post(self) -> None:
         """Write the request, which the compensation checks for in each period."""
@@ -101,6 +103,8 @@ class Stop(_Compensating):
 
 class State(_Compensating):
     """Present state of the compensations, as JSON."""
+
+    share = "stopping"
 
     async def get(self) -> None:
         """Send the state."""
@@ -132,7 +136,7 @@ class Figure(_Compensating):
 
     async def get(self) -> None:
         """Send the axes."""
-        self.finish({"item": await self.in_thread(following_item)})
+        await self.send({"item": await self.in_thread(following_item)})
 
 
 def handlers(context: Context) -> list[tuple[str, type[Guarded], dict[str, Any]]]:

@@ -44,7 +44,7 @@ class EffectOfRuns(_OfTwo):
             found = await self.effect() if all(chosen.values()) else None
         except ErrormotionError as error:
             wrong = str(error)
-        self.show(
+        await self.show(
             "effect.html.j2",
             rows=[row for row in table.rows if row.method][:MAX_LISTED],
             chosen=chosen,

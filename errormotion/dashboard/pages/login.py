@@ -18,13 +18,13 @@ class Login(Guarded):
 
     public = True
 
-    def get(self) -> None:
+    async def get(self) -> None:
         """Show the form."""
         known = self.context.access.accepts_session(self.get_cookie(self.context.cookie))
         if known and not self.context.control:  # for control the token can be presented again
             self.redirect("/")
             return
-        self.show("login.html.j2", refused=False)
+        await self.show("login.html.j2", refused=False)
 
     async def post(self) -> None:
         """Check the token."""
@@ -34,7 +34,7 @@ class Login(Guarded):
             if as_json:
                 raise HTTPError(403, reason="The token is wrong.")
             self.set_status(403)
-            self.show("login.html.j2", refused=True)
+            await self.show("login.html.j2", refused=True)
             return
         options = {"httponly": True, "samesite": "Strict", "secure": access.secure}
         self.set_cookie(self.context.cookie, access.session, **options)  # type: ignore[arg-type]

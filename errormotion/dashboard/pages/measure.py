@@ -88,6 +88,8 @@ class _UnreleasedError(Exception):
 class Measure(_OfCampaigns):
     """The page."""
 
+    share = "stopping"
+
     async def get(self) -> None:
         """Show the list of campaign files and one campaign."""
         campaigns = self.campaigns()
@@ -96,7 +98,7 @@ class Measure(_OfCampaigns):
         name = self.get_query_argument("file", None)
         name = (names[0] if names else "") if name is None else self.value("file")
         text = await self.in_thread(campaigns.read, name)
-        self.show(
+        await self.show(
             "measure.html.j2",
             control=self.context.control,
             names=names,
@@ -128,7 +130,7 @@ class Fields(_OfCampaigns):
                 raise HTTPError(400, reason="place: expected keys")
             written = self.found.get("value", "")
             form = await self.in_thread(self.campaigns().form, name, text, tuple(place), str(written))
-        self.finish(_plain(form))
+        await self.send(_plain(form))
 
 
 class Plan(_OfCampaigns):
@@ -175,13 +177,14 @@ class Resume(_OfCampaigns):
     async def post(self) -> None:
         """Continue the campaign, or send the motions that the person must release first."""
         (key,) = self.body("run")
-        self.finish(await self.released(processes.resume, self.context.lab.folder(key)))
+        folder = await self.in_thread(self.context.lab.folder, key)
+        self.finish(await self.released(processes.resume, folder))
 
 
 class Stop(_OfCampaigns):
     """Stop of a process."""
 
-    controls = True
+    controls = stops = True
 
     async def post(self) -> None:
         """Stop the process."""
@@ -208,6 +211,8 @@ class Answer(_OfCampaigns):
 class Processes(Guarded):
     """Processes of the folder of runs, as JSON."""
 
+    share = "stopping"
+
     async def get(self) -> None:
         """Send the running processes, and the last ended ones."""
         runs = self.context.lab.runs
@@ -219,8 +224,8 @@ class Live(Guarded):
 
     async def get(self) -> None:
         """Identify the samples so far, and send the figure of the errors."""
-        path = self.context.lab.folder(self.value("run", 600))
-        self.finish(await self.in_slow_thread(_LIVE.get, path, lambda: _live(path)))
+        path = await self.in_thread(self.context.lab.folder, self.value("run", 600))
+        await self.send(await self.in_slow_thread(_LIVE.get, path, lambda: _live(path)))
 
 
 _PROCESSES: TimedCache[list[dict[str, Any]]] = TimedCache(0.3)

@@ -35,7 +35,7 @@ class _OfTheBench(Guarded):
 class Now(_OfTheBench):
     """The page; `Values` provides its values."""
 
-    def get(self) -> None:
+    async def get(self) -> None:
         """Send the page without values."""
         watch = self.watch()
         names = list(watch.units.items())
@@ -43,7 +43,7 @@ class Now(_OfTheBench):
         for name, unit in names:
             groups.setdefault(unit, []).append(name)
         outline = machine_outline(watch.plan.description)
-        self.show("now.html.j2", bench=watch.plan.name, groups=groups, spans=SPANS, shown=SHOWN, outline=outline)
+        await self.show("now.html.j2", bench=watch.plan.name, groups=groups, spans=SPANS, shown=SHOWN, outline=outline)
 
 
 class Values(_OfTheBench):
@@ -67,7 +67,7 @@ class Figure(_OfTheBench):
         chosen = {name: units[name] for name in dict.fromkeys(names) if name in units}
         if not chosen:
             raise HTTPError(400, reason="None of these quantities is known")
-        self.finish({"item": await self.in_thread(live_item, chosen)})
+        await self.send({"item": await self.in_thread(live_item, chosen)})
 
 
 class History(_OfTheBench):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from tornado.escape import json_encode
 from tornado.ioloop import IOLoop
 from tornado.web import HTTPError, RequestHandler
 
@@ -18,6 +19,7 @@ from errormotion import __version__
 from errormotion.dashboard.access import Access
 from errormotion.dashboard.door import Budget
 from errormotion.dashboard.lab import Lab, NotFoundError
+from errormotion.dashboard.load import REFUSAL_DELAY, Load, Share
 from errormotion.dashboard.planning import Planner
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import ErrormotionError
@@ -87,6 +89,7 @@ class Context:
     """For requests to stop, and nothing else."""
     planner: Planner = field(default_factory=Planner)
     budget: Budget = field(default_factory=Budget)
+    load: Load = field(default_factory=Load)
 
     @property
     def cookie(self) -> str:
@@ -100,11 +103,16 @@ class Guarded(RequestHandler):
     public = False
     controls = False
     """Whether requests start, stop or change something; they are refused without ``--allow-control``."""
+    stops = False
+    """Whether requests stop something: they are served under any load."""
+    share: Share = "reading"
+    """The share of its client from which a request is served, if it may read."""
 
     def initialize(self, context: Context) -> None:
         """Set the context of the server."""
         self.context = context
         self._work: list[asyncio.Future[Any]] = []
+        self._counted: Share | None = None
         self._require_encryption()
 
     def set_default_headers(self) -> None:
@@ -126,8 +134,9 @@ class Guarded(RequestHandler):
         if self.context.access.secure:
             self.set_header("Strict-Transport-Security", f"max-age={HSTS}")
 
-    def prepare(self) -> None:
-        """Refuse a request that violates the rules of access."""
+    async def prepare(self) -> None:
+        """Refuse a request that violates the rules of access, or exceeds the share of its client."""
+        self.context.budget.settle(self._stream)
         access, session = self.context.access, self.get_cookie(self.context.cookie)
         method, host = str(self.request.method), self.request.headers.get("Host", "")
         found = access.refusal(
@@ -135,6 +144,8 @@ class Guarded(RequestHandler):
         )
         if found is None and self.controls and not self.context.control:
             found = 403, "The dashboard was started without --allow-control"
+        if found is not None or not self.stops:
+            await self._count("open" if found is not None or self.public else self.share)
         if found is None:
             if not self.public:  # one with a wrong token waits, and must not occupy its place
                 self.context.budget.begin(self._stream, trusted=bool(access.token))
@@ -145,13 +156,24 @@ class Guarded(RequestHandler):
             return
         raise HTTPError(found[0], reason=found[1])
 
+    async def _count(self, share: Share) -> None:
+        if self.context.load.begin(str(self.request.remote_ip), share):
+            self._counted = share
+            return
+        await self.ending_with_the_client(asyncio.sleep(REFUSAL_DELAY))
+        self.set_header("Retry-After", "2")
+        raise HTTPError(503, reason="Too many requests of this client; try again later")
+
     @property
     def _stream(self) -> Any:
         return getattr(self.request.connection, "stream", None)
 
     def on_finish(self) -> None:
-        """Count the connection as idle."""
+        """Count the connection as idle, and the request as answered."""
         self.context.budget.end(self._stream)
+        if self._counted is not None:
+            self.context.load.end(str(self.request.remote_ip), self._counted)
+            self._counted = None
 
     def on_connection_close(self) -> None:
         """Cancel the work for a client that has left; what waits for a thread is not begun."""
@@ -203,14 +225,23 @@ class Guarded(RequestHandler):
             raise HTTPError(400, reason=f"{name} is too long")
         return text
 
-    def show(self, template: str, **values: Any) -> None:
-        """Send a page; every value is escaped."""
+    async def show(self, template: str, **values: Any) -> None:
+        """Send a page, which a thread makes; every value is escaped."""
+        threads = self.context.workers if self.share == "reading" else self.context.states
+        self.finish(await self._in(threads, lambda: self._page(template, **values)))
+
+    async def send(self, document: dict[str, Any]) -> None:
+        """Send a JSON document, which a thread makes."""
+        self.set_header("Content-Type", "application/json; charset=UTF-8")
+        self.finish(await self.in_thread(json_encode, document))
+
+    def _page(self, template: str, **values: Any) -> str:
         machine = self.context.watch.plan.machine if self.context.watch is not None else ""
         common: dict[str, Any] = {"pages": self.context.pages, "here": self.request.path, "machine": machine}
         common |= {"version": __version__, "guarded": bool(self.context.access.token)}
-        self.finish(self.context.environment.get_template(template).render(**common, **values))
+        return self.context.environment.get_template(template).render(**common, **values)
 
-    def write_error(self, status_code: int, **kwargs: Any) -> None:  # noqa: ARG002 - as tornado calls it
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
         """Send an error message: that of an ErrormotionError, otherwise only the reason of the HTTP status."""
         error = kwargs.get("exc_info", (None, None, None))[1]
         message = self._reason
@@ -219,8 +250,12 @@ class Guarded(RequestHandler):
             message = str(error)
         elif not isinstance(error, HTTPError):
             message = "Internal error; the traceback is in the log file of the command."
-        if "text/html" in self.request.headers.get("Accept", ""):
-            self.show("error.html.j2", message=message[:MAX_MESSAGE])
+        wants_page = "text/html" in self.request.headers.get("Accept", "")
+        if wants_page and status_code == 503:  # one of many under load: text costs little
+            self.set_header("Content-Type", "text/plain; charset=UTF-8")
+            self.finish(message)
+        elif wants_page:
+            self.finish(self._page("error.html.j2", message=message[:MAX_MESSAGE]))
         else:
             self.finish({"error": message[:MAX_MESSAGE]})
 

@@ -16,7 +16,7 @@ from errormotion import datasets
 from errormotion.dashboard.cache import Cache, stamp
 from errormotion.dashboard.curves import CurveSet, as_csv, curves_of
 from errormotion.dashboard.figures import errors_item
-from errormotion.dashboard.lab import Choice, figure_text
+from errormotion.dashboard.lab import Choice, Lab, figure_text
 from errormotion.dashboard.pages.page import POLICY, Guarded
 from errormotion.dashboard.space import Drawing, drawing, has_volume
 from errormotion.datasets.results.merit import figures_of
@@ -51,7 +51,7 @@ class Results(Guarded):
         kept = {name: value for name, value in asdict(choice).items() if value}
         last = max(1, math.ceil(len(table.rows) / PAGE))
         links = {number: "?" + urlencode({**kept, "page": number}) for number in range(1, last + 1)}
-        self.show(
+        await self.show(
             "results.html.j2",
             table=table,
             rows=table.rows[first : first + PAGE],
@@ -68,12 +68,11 @@ class Run(Guarded):
     async def get(self) -> None:
         """Show figures of merit, figure, report and files of a run."""
         key = self.value("run", 600)
-        entry = await self.in_thread(self.context.lab.entry, key)
-        files = self.context.lab.files(key)
-        shown = await self.in_thread(_stated, self.context.lab.file(key, "errors")) if "errors" in files else None
+        entry, files = await self.in_thread(self.context.lab.run, key)
+        shown = await self.in_thread(_result, self.context.lab, key) if "errors" in files else None
         merit = entry.figures if entry.figures is not None or shown is None else shown["figures"]
         figures = [(each.name, *figure_text(each)) for each in merit or ()]
-        self.show("run.html.j2", key=key, entry=entry, files=files, figures=figures, result=shown)
+        await self.show("run.html.j2", key=key, entry=entry, files=files, figures=figures, result=shown)
 
 
 class Figure(Guarded):
@@ -81,13 +80,11 @@ class Figure(Guarded):
 
     async def get(self) -> None:
         """Send the figure of the errors at the functional point of the query."""
-        found = await self.in_thread(
-            _course, self.context.lab.file(self.value("run", 600), "errors"), *self.point_and_indices()
-        )
+        found = await self.in_thread(_course, self.context.lab, self.value("run", 600), *self.point_and_indices())
         freedoms = [text for text in self.get_query_arguments("freedom") if len(text) < 20]
         item = await self.in_thread(errors_item, found, freedoms)
         point = [1e3 * float(each) if math.isfinite(each) else None for each in found.point]
-        self.finish({"item": item, "point": point})
+        await self.send({"item": item, "point": point})
 
     def point_and_indices(self) -> tuple[tuple[float, ...] | None, dict[str, int]]:
         """Return functional point (m) and indices of the query.
@@ -108,11 +105,9 @@ class Space(Figure):
 
     async def get(self) -> None:
         """Send the drawing of the error vectors at the functional point of the query."""
-        found = await self.in_thread(
-            _drawing, self.context.lab.file(self.value("run", 600), "errors"), *self.point_and_indices()
-        )
+        found = await self.in_thread(_drawing, self.context.lab, self.value("run", 600), *self.point_and_indices())
         self.set_header("Content-Security-Policy", POLICY.replace("frame-ancestors 'none'", "frame-ancestors 'self'"))
-        self.show("space.html.j2", found=found)
+        await self.show("space.html.j2", found=found)
 
 
 class Values(Figure):
@@ -121,7 +116,7 @@ class Values(Figure):
     async def get(self) -> None:
         """Send the table."""
         key = self.value("run", 600)
-        found = await self.in_thread(_course, self.context.lab.file(key, "errors"), *self.point_and_indices())
+        found = await self.in_thread(_course, self.context.lab, key, *self.point_and_indices())
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}.csv"')
         self.finish(await self.in_thread(as_csv, found))
@@ -169,17 +164,17 @@ def loaded(path: Path) -> xr.Dataset:
     return LOADED.get(stamp(path), load)
 
 
-def _course(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> CurveSet:
-    return curves_of(loaded(path), point, select)
+def _course(lab: Lab, key: str, point: tuple[float, ...] | None, select: dict[str, int]) -> CurveSet:
+    return curves_of(loaded(lab.file(key, "errors")), point, select)
 
 
-def _drawing(path: Path, point: tuple[float, ...] | None, select: dict[str, int]) -> Drawing:
-    return drawing(loaded(path), point, select)
+def _drawing(lab: Lab, key: str, point: tuple[float, ...] | None, select: dict[str, int]) -> Drawing:
+    return drawing(loaded(lab.file(key, "errors")), point, select)
 
 
-def _stated(path: Path) -> dict[str, Any]:
+def _result(lab: Lab, key: str) -> dict[str, Any]:
     """Return the result of a run for its page: freedoms, functional point (mm), further dimensions, notes."""
-    ds = loaded(path)
+    ds = loaded(lab.file(key, "errors"))
     found = curves_of(ds)
     names = [(each.freedom, each.name, each.unit) for each in found.curves]
     point = [f"{1e3 * each:.10g}" for each in found.point]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -12,17 +13,18 @@ from typing import Any
 
 from errormotion.datasets.files import events
 from errormotion.datasets.files.events import Event
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import require_regular
 from errormotion.errors import RunError
 from errormotion.plugins import FigureOfMerit
 
 SCHEMA = "errormotion.run/1"
-MAX_FILE = 16 << 20
-"""Largest size of a ``run.json``, bytes."""
+MAX_READ = 2 << 20
+"""Bytes of a ``run.json`` that are read; the usual size is 20 kB. What stands after them is not shown."""
 MAX_TEXT = 200
 """Longest text, characters."""
 MAX_FIGURES = 200
 """Largest number of figures of merit of a run."""
+_SPACES = re.compile(r"[ \t\r\n]*")
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Entry:
         Notes on the run.
     damaged_notes : tuple of str
         A sentence for each note that cannot be read.
+    partial : str
+        A sentence on what was not read because ``run.json`` is too large; empty if it was read completely.
     """
 
     folder: str
@@ -61,6 +65,7 @@ class Entry:
     verdict: str = ""
     notes: tuple[Event, ...] = ()
     damaged_notes: tuple[str, ...] = ()
+    partial: str = ""
 
     @property
     def time(self) -> datetime | None:
@@ -89,15 +94,26 @@ def read_entry(folder: Path) -> Entry:
     Raises
     ------
     RunError
-        ``run.json`` is missing, too large, damaged, or has another schema.
+        ``run.json`` is missing, damaged, or has another schema.
     """
     file = folder / "run.json"
     try:
-        raw = read_bytes(file, MAX_FILE)
+        size = require_regular(file).st_size
+        with file.open("rb") as stream:
+            raw = stream.read(MAX_READ)
     except OSError as error:
         raise RunError(f"{file}: cannot be read: {error.strerror}") from error
+    partial = ""
     try:
-        data = json.loads(raw)
+        if size > MAX_READ:
+            data: Any = first_keys(raw.decode(errors="ignore"))
+            last = next(reversed(data), "")
+            partial = (
+                f"{file}: has {size} bytes, of which the first {MAX_READ} are read: "
+                f"what stands after the key '{_text(last)}' is not shown"
+            )
+        else:
+            data = json.loads(raw)
     except (ValueError, RecursionError) as error:
         raise RunError(f"{file}: is not valid JSON ({error})") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
@@ -115,12 +131,66 @@ def read_entry(folder: Path) -> Entry:
         figures_from(data.get("results")),
         _text(data.get("conformity"), "verdict"),
         *events.read(folder),
+        partial=partial,
     )
+
+
+def first_keys(text: str) -> dict[str, Any]:
+    """Return the complete keys and values at the start of a JSON object that may be cut.
+
+    Of a list that is cut, the complete elements are returned, `MAX_FIGURES` at most.
+
+    Raises
+    ------
+    ValueError
+        The text does not start like a JSON object.
+    """
+    decode, found = json.JSONDecoder().raw_decode, dict[str, Any]()
+    at = _after(text, 0, "{")
+    while True:
+        try:
+            name, at = decode(text, _after(text, at))
+            start = at = _after(text, _after(text, at, ":"))
+        except ValueError:
+            if not found:
+                raise
+            return found
+        if not isinstance(name, str):
+            raise ValueError(f"expected a key at character {at}")
+        try:
+            found[name], at = decode(text, at)
+            at = _after(text, at, ",")
+        except ValueError:  # the end of the object, or where it is cut
+            if text[start : start + 1] == "[" and name not in found:
+                found[name] = _first_elements(text, start, decode)
+            return found
+
+
+def _first_elements(text: str, at: int, decode: Callable[[str, int], tuple[Any, int]]) -> list[Any]:
+    elements: list[Any] = []
+    try:
+        at = _after(text, at, "[")
+        while len(elements) < MAX_FIGURES:
+            element, end = decode(text, _after(text, at))
+            at = _after(text, end, ",")
+            elements.append(element)
+    except ValueError:
+        pass
+    return elements
+
+
+def _after(text: str, at: int, sign: str = "") -> int:
+    """Return the place after spaces, and after a sign if it is expected."""
+    found = _SPACES.match(text, at)
+    at = found.end() if found else at
+    if not text.startswith(sign, at):
+        raise ValueError(f"expected {sign!r} at character {at}")
+    return at + len(sign)
 
 
 def from_plain(data: Any) -> Entry | None:
     """Return the entry of a JSON file; None if it is damaged."""
-    names = ("folder", "created", "machine", "test", "method", "campaign", "status", "errors", "verdict")
+    names = ("folder", "created", "machine", "test", "method", "campaign", "status", "errors", "verdict", "partial")
     if not isinstance(data, dict) or not all(isinstance(data.get(name), str) for name in names):
         return None
     notes, damaged = data.get("notes"), data.get("damaged_notes")

@@ -58,6 +58,8 @@ class Folder:
                 self.skipped[name] = str(error)
                 continue
             self.entries[name] = entry
+            if entry.partial:
+                self.skipped[f"{name} (in part)"] = entry.partial
             for number, reason in enumerate(entry.damaged_notes):
                 self.skipped[f"{name} (note {number})"] = reason
             if now - max(stamp.changed, stamp.notes_changed) > SETTLING_TIME:
