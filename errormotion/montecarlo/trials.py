@@ -33,7 +33,7 @@ def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset
             "no 'redrawing'. Its linear uncertainty is not affected."
         )
     found: Redrawing = method.redrawing(raw, settings, errors)
-    check_centre(method.identify(found.raw, found.settings), errors)
+    check_centre((found.identify or method.identify)(found.raw, found.settings), errors)
     return found
 
 
@@ -88,7 +88,7 @@ def trial(method: Any, redrawing: Redrawing, sequence: SeedSequence, only: Itera
     for name, generator in generators.items():
         if (draw := redrawing.sources[name].draw) is not None:
             raw, settings = draw(raw, settings, generator)
-    errors: xr.Dataset = method.identify(raw, settings)
+    errors: xr.Dataset = (redrawing.identify or method.identify)(raw, settings)
     for name, generator in generators.items():
         if (act := redrawing.sources[name].act) is not None:
             errors = act(errors, generator)

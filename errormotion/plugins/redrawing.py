@@ -54,11 +54,15 @@ class Redrawing:
         stated, tests for outliers are off, and results without effect on the values are omitted.
     sources : mapping of str to Redraw
         By name, in their order of application.
+    identify : function, optional
+        ``identify(raw, settings)`` returns the error dataset of a trial, in place of that of the method: for a method
+        whose ``raw`` here is not its raw data, but the arrays of its measurement model.
     """
 
     raw: xr.Dataset
     settings: Any
     sources: Mapping[str, Redraw]
+    identify: Callable[[xr.Dataset, Any], xr.Dataset] | None = None
 
 
 def replaced(dataset: xr.Dataset, values: Mapping[str, ArrayLike]) -> xr.Dataset:

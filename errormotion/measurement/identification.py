@@ -1,0 +1,153 @@
+"""Identification by a measurement model: fit, noise, errors relative to their datum, and the error dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.timing import start_of
+from errormotion.errors import FitError, MethodError
+from errormotion.estimation.datum import Relative, relative
+from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.sources import Errors, errors_of
+from errormotion.estimation.variance import Scatter, expansion, variance_factor
+from errormotion.kinematics.iso import DOF
+from errormotion.measurement.observed import Model, Observed
+from errormotion.plugins import MethodInfo
+
+__all__ = ["Solved", "dataset", "identify", "solve"]
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The solution of a model: the fit, what its residuals say about the noise, and the errors with their datum."""
+
+    observed: Observed
+    fit: Fit
+    scatter: Scatter
+    relative: Relative
+
+
+def solve(observed: Observed) -> Solved:
+    """Return the solution of a problem.
+
+    Raises
+    ------
+    MethodError
+        The readings do not determine the unknowns, or neither noise nor redundancy is there.
+    """
+    try:
+        found = fit(observed.problem, refresh=observed.refresh, what=observed.what)
+        scatter = variance_factor(
+            found.chi2,
+            found.freedom,
+            stated=observed.problem.noise.stated,
+            increase=observed.noise_increases,
+            what=observed.what,
+            cause=observed.noise_cause,
+        )
+        # An estimated variance has a Student distribution (GUM, G.3.2).
+        factor = scatter.factor * float(expansion(scatter.freedom)) ** 2
+        return Solved(
+            observed,
+            found,
+            scatter,
+            related(observed, errors_of(found, observed.places, factor=factor, shared=observed.shared)),
+        )
+    except FitError as error:
+        raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
+
+
+def related(observed: Observed, errors: Errors) -> Relative:
+    """Return errors relative to the datum of the model."""
+    if observed.datum is None:
+        none = np.zeros(0)
+        return Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
+    return relative(errors, observed.datum)
+
+
+def identify(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> xr.Dataset:
+    """Return the error dataset of raw data that follow their schema.
+
+    Raises
+    ------
+    MethodError
+        The data do not determine the result.
+    """
+    solved = solve(model.observe(raw, settings))
+    origin = provenance.make(settings, raw, None, steps=[f"least squares of {solved.observed.what}"])
+    return dataset(model, solved, raw, info, origin)
+
+
+def dataset(
+    model: Model, solved: Solved, raw: xr.Dataset, info: MethodInfo, origin: Any, *, planned: bool = False
+) -> xr.Dataset:
+    """Return the error dataset of a solution; with ``planned`` its values are 0 where they are known."""
+    observed, errors = solved.observed, solved.relative.errors
+    shape = tuple(_size(observed, dim) for dim in observed.dims)
+    value = np.where(np.isfinite(errors.value), 0.0, np.nan) if planned else errors.value
+    names = _unique([source.name for source in errors.sources])
+    notes = [*observed.notes, solved.scatter.note] if not planned else [*observed.notes]
+    extras = dict(observed.extras) | dict(model.results(observed, solved.fit, solved.relative))
+    return build_errors(
+        _placed(value, observed, shape),
+        _square(errors.covariance, observed, shape),
+        dims=observed.dims,
+        coords=observed.coords,
+        component=observed.component,
+        machine="plan" if planned else str(raw.attrs.get("machine", "unknown")),
+        frame=observed.frame,
+        functional_point=np.asarray(observed.functional_point, dtype=float),
+        reference=f"{observed.reference} (planned, not measured)" if planned else observed.reference,
+        method=info.id,
+        method_version=info.version,
+        provenance=origin,
+        influence=np.array([_placed(source.effect, observed, shape) for source in errors.sources]).reshape(
+            len(names), *shape, 6
+        ),
+        sources=names,
+        source_groups=[source.group for source in errors.sources],
+        source_ids={name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
+        extras=extras,
+        start="" if planned else start_of(raw),
+        measured=None if planned else raw.attrs,
+        **observed.attributes,
+    ).assign_attrs(notes=[note for note in notes if note] or [""])
+
+
+def _size(observed: Observed, dim: str) -> int:
+    """Return the size of a dim of the result, from its coordinate or the number of places."""
+    value = observed.coords.get(dim)
+    if value is None:
+        return observed.places.count
+    return len(value[1]) if isinstance(value, tuple) else len(value)
+
+
+def _placed(values: Array, observed: Observed, shape: tuple[int, ...]) -> Array:
+    """Return values (place, d) as (..., 6), NaN for the freedoms that the model does not determine."""
+    found = np.full((len(values), 6), np.nan)
+    found[:, [DOF.index(name) for name in observed.freedoms]] = values
+    return found.reshape(*shape, 6)
+
+
+def _square(covariance: Array, observed: Observed, shape: tuple[int, ...]) -> Array:
+    """Return covariances (place, d, d) as (..., 6, 6)."""
+    which = np.array([DOF.index(name) for name in observed.freedoms])
+    found = np.full((len(covariance), 6, 6), np.nan)
+    found[:, which[:, None], which] = covariance
+    return found.reshape(*shape, 6, 6)
+
+
+def _unique(names: list[str]) -> list[str]:
+    """Return names with a number where one occurs several times."""
+    seen: dict[str, int] = {}
+    found = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        found.append(name if names.count(name) == 1 else f"{name} {seen[name]}")
+    return found

@@ -1,0 +1,105 @@
+"""What a model states about raw data: the problem, the places of its errors, and what the result is called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from errormotion.kinematics.iso import DOF
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from errormotion.estimation.datum import Datum, Relative
+    from errormotion.estimation.fit import Fit
+    from errormotion.estimation.problem import Problem
+    from errormotion.estimation.sources import Places
+
+__all__ = ["Model", "Observed"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Observed:
+    """Raw data as a problem of least squares, and the errors that follow from its solution.
+
+    Attributes
+    ----------
+    problem : Problem
+        Readings with their equation, unknowns and constants; `errormotion.estimation`.
+    places : Places
+        Where errors are wanted; its equation returns (place, d), m and rad.
+    freedoms : sequence of str, (d,)
+        What the d errors are, among EX EY EZ EA EB EC.
+    dims : sequence of str
+        Of the result; the places are in their order. Empty for one place.
+    coords : mapping
+        As for `errormotion.datasets.build_errors`: name to array, or to (dims, array, attributes).
+    component, reference, frame : str
+        Attributes of the error dataset.
+    functional_point : sequence of float, (3,)
+        m.
+    datum : Datum, optional
+        What the errors are relative to; without one they are as the equation states them.
+    recorded : tuple of str, and its dims
+        The variable of the raw data that the readings are, and the dims in the order of the readings. With it, the
+        framework simulates raw data.
+    shared : str
+        Group in the budget of the noise of the readings as far as places have it in common.
+    what : str
+        The readings, as the subject of a sentence of the notes: "the touches".
+    noise_cause : str
+        A remedy, for the note on readings that scatter more than stated.
+    noise_increases : bool
+        Whether the uncertainties follow the residuals if these scatter more than stated.
+    refresh : callable, optional
+        See `errormotion.estimation.fit.fit`.
+    extras : mapping of str to DataArray
+        Further variables of the result that follow from the raw data.
+    attributes : mapping
+        Further arguments of `errormotion.datasets.build_errors`.
+    notes : sequence of str
+        What the reader of the raw data noticed.
+    """
+
+    problem: Problem
+    places: Places
+    dims: Sequence[str]
+    coords: Mapping[str, Any]
+    component: str
+    functional_point: Sequence[float]
+    reference: str
+    freedoms: Sequence[str] = DOF
+    frame: str = "machine"
+    datum: Datum | None = None
+    recorded: tuple[str, tuple[str, ...]] | None = None
+    shared: str = "readings"
+    what: str = "the readings"
+    noise_cause: str = ""
+    noise_increases: bool = True
+    refresh: Callable[[Problem, Any], Problem] | None = None
+    extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    notes: Sequence[str] = ()
+
+
+class Model(Protocol):
+    """The measurement model of a method."""
+
+    def observe(self, raw: xr.Dataset, settings: Any) -> Observed:
+        """Return what raw data, which follow their schema, mean; the only place that sees datasets and settings.
+
+        Raises
+        ------
+        MethodError
+            The data do not determine the result, with a remedy.
+        """
+
+    def expected(self, settings: Any) -> xr.Dataset:
+        """Return raw data as a test with these settings would give them without noise, for errors of typical size.
+
+        The size matters: an error of 0 hides every source that multiplies it.
+        """
+
+    def results(self, observed: Observed, fit: Fit, relative: Relative) -> Mapping[str, xr.DataArray]:
+        """Return further variables of the result that follow from the solution."""

@@ -1,0 +1,203 @@
+"""A small method on the measurement model: identification, plan, Monte Carlo and simulation from one statement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import pytest
+import xarray as xr
+from pydantic import Field
+
+from errormotion import datasets
+from errormotion.arrays import Array
+from errormotion.datasets.schemas import NO_LIMIT, NOISE, READING, RawSchema, Row
+from errormotion.errors import MethodError
+from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.datum import Datum
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.sources import Places
+from errormotion.measurement import ModelMethod, Observed
+from errormotion.measurement.drawing import READINGS
+from errormotion.montecarlo.trials import redrawing_of, trial, values_of
+from errormotion.plugins import MethodInfo, Needs, PluginSettings
+
+T = TypeVar("T")
+SCHEMA = "errormotion.raw.drift_of_scale/1"
+
+
+class Unknowns(NamedTuple, Generic[T]):
+    drift: T
+
+
+class Known(NamedTuple, Generic[T]):
+    gain: T
+
+
+class DriftSettings(PluginSettings):
+    interval: float = Field(60.0, gt=0)
+    times: int = Field(8, ge=2)
+    repeats: int = Field(5, ge=1)
+    noise: float = Field(0.5e-6, gt=0)
+    gain: float = Field(0.02, ge=0, description="relative standard uncertainty of the gain")
+
+
+class Drift(ModelMethod):
+    """Drift along Z from repeated readings of a sensor whose gain is uncertain."""
+
+    info: ClassVar[MethodInfo] = MethodInfo(id="drift_of_scale", summary="Test method", status="simulated_only")
+    needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA)
+    Settings: ClassVar[type[PluginSettings]] = DriftSettings
+    raw_schemas = (
+        RawSchema(
+            SCHEMA,
+            variant="",
+            marker="reading",
+            rows=(
+                Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "increasing"),
+                Row("reading", ("time", "repeat"), "m", *READING, "position of the surface", missing=True),
+                Row("reading_noise", (), "m", *NOISE, "standard deviation of one reading", required=False),
+            ),
+        ),
+    )
+
+    def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+        y = raw["reading"].transpose("time", "repeat").values.astype(float)
+        n, m = y.shape
+        index = np.repeat(np.arange(n), m)
+        noise = float(raw["reading_noise"]) if "reading_noise" in raw else None
+        heard = np.isfinite(y).any(axis=1)
+
+        def equation(y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
+            return np.asarray(y - c.gain[:, 0] * x.drift[:, 0])
+
+        gain = Constant(
+            value=np.ones((1, 1)), factor=np.full((1, 1, 1), settings.gain), index=np.zeros(n * m, dtype=int),
+            scale=1.0, group="gain", identity=["certificate 3: sensor, gain"],
+        )  # fmt: skip
+        first = np.zeros((n, 1))
+        first[0] = 1.0
+        start = np.where(heard, 0.0, np.nan)[:, None]
+        return Observed(
+            problem=Problem(
+                equation=equation,
+                readings=y.ravel(),
+                unknowns=Unknowns(Block(start=np.nan_to_num(start), index=index, scale=1e-3, free=heard)),
+                constants=Known(gain),
+                noise=Noise(sd=np.full(n * m, noise or 1.0), stated=noise is not None),
+            ),
+            places=Places(lambda x, c: x.drift + start, n),
+            freedoms=("EZ",),
+            dims=("time",),
+            coords={"time": raw["time"].values},
+            component="tool",
+            functional_point=(0, 0, 0),
+            reference="first time",
+            datum=Datum(np.ones((n, 1, 1)), first, "reference state"),
+            recorded=("reading", ("time", "repeat")),
+        )
+
+    def expected(self, settings: DriftSettings) -> xr.Dataset:
+        time = settings.interval * np.arange(settings.times)
+        drift = np.tile(20e-6 * (1 - np.exp(-time / 900))[:, None], settings.repeats)
+        return xr.Dataset(
+            {"reading": (("time", "repeat"), drift, {"units": "m"}),
+             "reading_noise": ((), settings.noise, {"units": "m"})},
+            {"time": ("time", time, {"units": "s"})},
+            {"schema": SCHEMA},
+        )  # fmt: skip
+
+
+METHOD = Drift()
+SETTINGS = DriftSettings.model_validate({})
+
+
+def test_the_result_is_a_valid_error_dataset() -> None:
+    raw, truth = METHOD.simulate(SETTINGS, 1)
+    errors = METHOD.identify(raw, SETTINGS)
+    datasets.validate(errors)
+    datasets.validate(truth)
+    mean = raw["reading"].mean("repeat").values
+    assert errors["EZ"].values == pytest.approx(mean - mean[0], abs=1e-15)
+    v = SETTINGS.noise**2 / SETTINGS.repeats
+    gain = SETTINGS.gain * errors["EZ"].values[1:]
+    assert errors["covariance"].values[1:, 2, 2] == pytest.approx(2 * v + gain**2, rel=1e-7)
+    assert errors["covariance"].values[0, 2, 2] == 0.0
+    assert np.isnan(errors["EX"]).all()
+    assert set(errors["source_group"].values.tolist()) == {"gain", "reference state"}
+    assert "certificate 3: sensor, gain" in errors["source_id"].values
+
+
+def test_unknown_noise_follows_from_the_repeats() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = METHOD.identify(raw.drop_vars("reading_noise"), SETTINGS)
+    assert "is not stated" in errors.attrs["notes"][0]
+    s2 = raw["reading"].var("repeat", ddof=1).mean().item()
+    student = np.square(errors["covariance"].values[1, 2, 2] - (0.02 * errors["EZ"].values[1]) ** 2) ** 0.5
+    assert student == pytest.approx(2 * s2 / SETTINGS.repeats, rel=0.15)
+    with pytest.raises(MethodError, match="no redundancy to estimate it"):
+        METHOD.identify(raw.drop_vars("reading_noise").isel(repeat=[0]), SETTINGS)
+
+
+def test_a_time_without_reading_is_unknown() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    raw["reading"][3] = np.nan
+    errors = METHOD.identify(raw, SETTINGS)
+    assert np.flatnonzero(np.isnan(errors["EZ"].values)).tolist() == [3]
+    raw["reading"][0] = np.nan
+    with pytest.raises(MethodError, match="do not determine the datum"):
+        METHOD.identify(raw, SETTINGS)
+
+
+def test_plan_and_identification_have_the_same_sources() -> None:
+    planned = METHOD.plan(SETTINGS)
+    errors = METHOD.identify(METHOD.expected(SETTINGS), SETTINGS)
+    assert planned["source"].values.tolist() == errors["source"].values.tolist()
+    assert planned["covariance"].values == pytest.approx(errors["covariance"].values, nan_ok=True)
+    assert (planned["EZ"].values == 0).all()
+    assert planned.attrs["reference"] == "first time (planned, not measured)"
+
+
+def test_monte_carlo_agrees_with_the_linear_uncertainty() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 2)
+    errors = METHOD.identify(raw, SETTINGS)
+    redrawing = redrawing_of(METHOD, raw, SETTINGS, errors)
+    assert list(redrawing.sources) == [READINGS, "gain"]
+    values = np.array([values_of(trial(METHOD, redrawing, np.random.SeedSequence(7, spawn_key=(k,))))[:, 2]
+                       for k in range(300)])  # fmt: skip
+    u = np.sqrt(errors["covariance"].values[1:, 2, 2])
+    assert values[:, 1:].std(axis=0) == pytest.approx(u, rel=0.15)
+    only = [values_of(trial(METHOD, redrawing, np.random.SeedSequence(7, spawn_key=(k,)), only=["gain"]))[-1, 2]
+            for k in range(100)]  # fmt: skip
+    assert np.std(only) == pytest.approx(SETTINGS.gain * errors["EZ"].values[-1], rel=0.25)
+
+
+def test_simulated_data_are_covered() -> None:
+    inside, seeds = 0, 150
+    for seed in range(seeds):
+        raw, truth = METHOD.simulate(SETTINGS, seed)
+        errors = METHOD.identify(raw, SETTINGS)
+        off = (errors["EZ"] - truth["EZ"]).values[-1]
+        inside += abs(off) <= 1.96 * np.sqrt(errors["covariance"].values[-1, 2, 2])
+    assert abs(inside / seeds - 0.95) < 3.3 * np.sqrt(0.95 * 0.05 / seeds)
+
+
+def test_a_method_without_instruments_refuses_to_measure() -> None:
+    with pytest.raises(MethodError, match="imported data only"):
+        METHOD.acquire(None, SETTINGS, inputs={})  # type: ignore[arg-type]
+    assert METHOD.append_dim(SETTINGS) == "time"
+    assert METHOD.progress(replace_times(SETTINGS, 5)) == 5
+
+
+def replace_times(settings: DriftSettings, times: int) -> Any:
+    return settings.model_copy(update={"times": times})
+
+
+def test_simulation_needs_the_variable_of_the_readings() -> None:
+    class Silent(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            return replace(super().observe(raw, settings), recorded=None)
+
+    with pytest.raises(ValueError, match="recorded"):
+        Silent().simulate(SETTINGS, 0)
