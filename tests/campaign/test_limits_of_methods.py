@@ -11,6 +11,7 @@ from command_line import CliRunner
 from errormotion import plugins
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
+from errormotion.campaign.planning import release
 from errormotion.cli.app import app
 from errormotion.cli.demo import probing
 from errormotion.errors import BenchError, InstrumentError, RunError
@@ -183,6 +184,21 @@ def test_a_method_without_stated_motions_moves_nothing(write: Write, tmp_path: P
     result = CliRunner().invoke(app, ["run", str(path), "--dry-run"])
     assert result.exit_code not in (0, 70)
     assert "'wanderer' does not state its motions" in result.output
+
+
+def test_a_method_that_states_that_nothing_moves_moves_nothing(
+    write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its test needs no release, so that nobody has allowed a motion."""
+    path = write(METHOD + "    def motions(self, settings, instruments): return []\n")
+    plan = load_campaign(path)
+    monkeypatch.setattr(release, "is_simulated", lambda bench: False)
+    assert release.to_release(plan, plan.tests) == []
+    with plugins.get("instruments", "virtual_controller")("sim://cframe/c?seed=77") as watching:
+        before = watching.state()["position"]
+        with pytest.raises(RunError, match=r"move to .*: refused, since the method 'wanderer' states that nothing mov"):
+            runner.run(plan, runs=tmp_path / "runs")
+        assert watching.state()["position"] == before
 
 
 def test_a_method_that_writes_programs_and_states_no_motions_is_refused_when_it_is_read(write: Write) -> None:

@@ -1,5 +1,6 @@
 """The set-up uses pinned packages, runs once, and reports missing tools."""
 
+import ast
 import os
 import re
 import shutil
@@ -7,6 +8,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -170,3 +172,33 @@ def test_open3d_loads_with_the_system_libraries_that_ci_installs() -> None:
     if "cannot open shared object file" in done.stderr or "No module named" in done.stderr:
         pytest.skip(f"Open3D cannot be loaded: {done.stderr.strip().splitlines()[-1].partition(': ')[2]}")
     assert done.returncode == 0, done.stderr
+
+
+def test_every_dependency_is_imported_by_the_package() -> None:
+    imported = set()
+    for path in (ROOT / "errormotion").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                imported.add(node.module.partition(".")[0])
+    modules: dict[str, set[str]] = {}
+    for module, distributions in packages_distributions().items():
+        for each in distributions:
+            modules.setdefault(canonicalize_name(each), set()).add(module)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = [Requirement(item).name for item in project["dependencies"]]
+    assert [name for name in needed if not modules[canonicalize_name(name)] & imported] == []
+
+
+def test_ci_without_root_fails_and_says_so(tmp_path: Path) -> None:
+    """The commands that it needs before are those of the system; `id` states another user."""
+    for name in ("bash", "dirname"):
+        (tmp_path / name).symlink_to(str(shutil.which(name)))
+    (tmp_path / "id").write_text("#!/bin/sh\necho 1000\n")
+    (tmp_path / "id").chmod(0o755)
+    command = [str(tmp_path / "bash"), str(ROOT / ".ci" / "run")]
+    found = subprocess.run(command, env={"PATH": str(tmp_path)}, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 1
+    assert found.stderr.startswith(".ci/run: it needs root")
+    assert "== setup" not in found.stdout

@@ -169,6 +169,21 @@ def test_g92_3_restores_the_stored_offset_or_the_cut_is_refused(tmp_path: Path) 
         list(Reader(stated(tmp_path)).items(lines))
 
 
+@needs_linuxcnc
+def test_the_interpreter_restores_the_stored_offset_as_well(tmp_path: Path) -> None:
+    lines = [*HEAD[:1], "F100", "G92.3", "G0 X0 Y0 Z0", "#1=1", "G1 X#1", "M2"]
+    offsets = control(tmp_path)
+    with closing(canonical.commands(lines, offsets)) as commands:
+        new = list(Expansion(lines, offsets, 1e-6).lines(commands))
+    (move,) = (item for item in Reader(offsets).items(new) if getattr(item, "kind", -1) == LINE)
+    assert np.allclose(move.frame.machine(move.end), [8e-3, 8e-3, 109e-3])
+    program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
+    program.write_text("\n".join([*lines, ""]))
+    with pytest.raises(ProgramError, match=r"restores an offset of G92"):
+        compensate(program, out, zero, stated(tmp_path), Settings(route="interpreter"))
+    assert not out.exists()
+
+
 def test_an_active_offset_of_which_an_axis_is_not_stated_is_unknown(tmp_path: Path) -> None:
     offsets = control(tmp_path, parameters=STATED.replace("5210 0", "5210 1").replace("5212 8\n", ""))
     with pytest.raises(ProgramError, match="unknown position"):

@@ -171,6 +171,8 @@ def test_without_a_chain_there_are_no_axes(raw):
 
 def test_the_uncertainty_of_the_scale_is_in_the_budget(raw, errors):
     found = Multilateration().identify(raw, Settings(scale_uncertainty="2 um/m"))
+    assert "Assumed: no uncertainty of the tracker's lengths (scale_uncertainty = 0)." in notes(errors)
+    assert "tracker's lengths" not in notes(found)
     budget = found.em.budget()
     assert list(budget["group"].values) == ["stations", "scale of the tracker", "independent"]
     place = raw["target_nominal"].values

@@ -146,6 +146,15 @@ def test_more_noise_than_stated_is_reported_and_increases_the_uncertainty(machin
     assert not any("stated noise" in note for note in honest.attrs["notes"])
 
 
+def test_an_uncertainty_of_the_radius_that_is_not_stated_is_noted(machine, method):
+    raw = simulation.raw_drift(machine, TIMES, seed=0)
+    assumed, stated = method.identify(raw), method.identify(raw, Settings(bar_radius_uncertainty="1 um"))
+    note = "Assumed: no uncertainty of the radius of the bar (bar_radius_uncertainty = 0)."
+    assert note in assumed.attrs["notes"]
+    assert not any("radius of the bar" in each for each in stated.attrs["notes"])
+    xr.testing.assert_equal(assumed["EX"], stated["EX"])
+
+
 def test_a_sensor_out_of_range_for_ten_minutes_loses_only_these(machine, method):
     t = np.arange(0, 3600.0, 10.0)
     raw = simulation.raw_drift(machine, t, seed=7)
