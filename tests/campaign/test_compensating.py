@@ -20,7 +20,7 @@ from errormotion import datasets
 from errormotion.campaign.compensation.compensating import Compensation, Moment
 from errormotion.campaign.compensation.following import AUDIT
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan, parse_bench
-from errormotion.compensation.online.audit import verify
+from errormotion.compensation.online.audit import Verdict, check
 from errormotion.compensation.online.follower import State
 from errormotion.compensation.online.settings import Limits
 from errormotion.compensation.thermal_model import ThermalModel
@@ -196,7 +196,9 @@ def test_it_follows_the_temperature_and_ramps_to_zero_when_stopped(
     assert min(offset[0] for offset in Machine.written) == pytest.approx(-10e-6)
     assert Machine.offset == (0.0, 0.0, 0.0)
     never_beyond()
-    count, _ = verify(compensation.folder.path / AUDIT)
+    checked = check(compensation.folder.path / AUDIT)
+    assert (checked.verdict, checked.ended) == (Verdict.UNBROKEN, True)
+    count = checked.entries
     entries = [json.loads(line)["entry"] for line in (compensation.folder.path / AUDIT).read_text().splitlines()]
     assert len(entries) == count > 10
     assert entries[0]["event"] == "armed"
