@@ -17,12 +17,13 @@ import numpy as np
 import xarray as xr
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
-from scipy import linalg, special
+from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.errors import DatasetError
+from errormotion.estimation.evidence import eliminated, maximum_evidence
 from errormotion.estimation.information import weights
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
@@ -39,8 +40,8 @@ DECISIVE_ORDER = 2
 """Highest order that decides whether a freedom is determined."""
 PASSES, SETTLED = 30, 0.05
 """Largest number of iterations for the size of the prior, and the change of its logarithm that ends them."""
-ROUNDING = 1e-13
-"""Regularisation added to the diagonal of a scaled matrix before its inversion."""
+SMALLEST = 1e-3
+"""Smallest size of the prior, in units of the standard uncertainty of a single coefficient."""
 FLAT = 1e-13
 """Weight of the prior of terms without a prior, in units of the information of one column."""
 FALSE_ALARM = 1e-3
@@ -116,8 +117,8 @@ def predict(
     F = np.concatenate([shared, np.moveaxis(root, 2, 0)])
     value[:, ~seen], F[:, :, ~seen] = np.nan, np.nan
     own = fit.tail(positions, k)[:, None, None] * np.eye(6)
-    own[:, :3, :3] *= fit.tau.get(2 * k, 0.0) ** 2
-    own[:, 3:, 3:] *= fit.tau.get(2 * k + 1, 0.0) ** 2
+    own[:, :3, :3] *= fit.tau[2 * k] ** 2
+    own[:, 3:, 3:] *= fit.tau[2 * k + 1] ** 2
     own[:, ~seen], own[:, :, ~seen] = np.nan, np.nan
     number = volume.sizes.get("source", 0)
     source, group, identity = sources_of(volume)
@@ -145,7 +146,7 @@ class _Fit:
     shared: Array
     open: Array
     size: Array
-    tau: dict[int, float]
+    tau: Array
     falloff: float
     factor: float
     low: Array
@@ -175,7 +176,7 @@ def _fitted(volume: xr.Dataset, model: Machine) -> _Fit:
     low, high = q.min(axis=0), q.max(axis=0)
     terms, flat = _terms(model)
     none = np.zeros(0)
-    blank = _Fit(terms, flat, none, none, none, none, none, {}, 0.0, 1.0, low, high)
+    blank = _Fit(terms, flat, none, none, none, none, none, none, 0.0, 1.0, low, high)
     columns, s = len(terms) + (9 if turns else 6), len(F)
     N, b, square = np.zeros((columns + s, columns + s)), np.zeros(columns + s), 0.0
     tool = np.asarray(volume.attrs["functional_point"], dtype=float)
@@ -192,86 +193,35 @@ def _fitted(volume: xr.Dataset, model: Machine) -> _Fit:
         b += np.einsum("tip,ti->p", WA, data)
         square += float(np.einsum("ti,tij,tj->", data, W, data))
     N[columns:, columns:] += np.eye(s)
-    M, right = N[columns:, columns:], N[:columns, columns:]
-    gain: Array = np.zeros((columns, 0))
-    if s:
-        gain = np.asarray(np.linalg.solve(M, right.T).T)
-    square -= float(b[columns:] @ np.linalg.solve(M, b[columns:])) if s else 0.0
-    b, N = b[:columns] - gain @ b[columns:], N[:columns, :columns] - gain @ right.T
-    return _maximum_evidence(blank, N, b, gain, square, int(known.sum()))
+    N, b, square, gain = eliminated(N, b, square, s)
+    return _with_coefficients(blank, N, b, gain, square, int(known.sum()))
 
 
-def _maximum_evidence(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int) -> _Fit:
+def _with_coefficients(blank: _Fit, N: Array, b: Array, gain: Array, square: float, count: int) -> _Fit:
     """Return the coefficients for the prior of maximum evidence, with their covariance."""
     n = len(blank.terms)
     order = np.concatenate([[o for _, o in blank.terms], np.full(len(N) - n, -1)]).astype(float)
     group = np.concatenate([[-1 if flat else _group(e) for (e, _), flat in zip(blank.terms, blank.flat, strict=True)],
-                            np.full(len(N) - n, -1)]).astype(int)  # fmt: skip
-    size = np.sqrt(np.diag(N))
-    unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
-    found = [_with_falloff(N * np.outer(unit, unit), b * unit, unit, order, group, p) for p in FALLOFFS]
-    best = max(found, key=lambda each: each.evidence)
-    C, value = best.half.T @ best.half * np.outer(unit, unit), best.value * unit
+                            np.full(len(N) - n, -1)]).astype(np.intp)  # fmt: skip
+    found = maximum_evidence(
+        N, b, group, order, exponents=FALLOFFS, smallest=SMALLEST, regularisation=FLAT, passes=PASSES, tolerance=SETTLED
+    )
+    C, value = found.covariance, found.value
     rest, degrees = max(square - float(b @ value), 0.0), max(count - int((group < 0).sum()), 1)
     factor = rest / degrees if special.chdtrc(degrees, rest) < FALSE_ALARM else 1.0
     shared = C @ gain
     own = np.sqrt(factor) * factor_of(C - shared @ shared.T, np.sqrt(np.diag(C)))
+    size = np.sqrt(np.diag(N))
+    unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
     low = np.flatnonzero((order <= DECISIVE_ORDER) | (group < 0))
     power, vectors = np.linalg.eigh((N * np.outer(unit, unit))[np.ix_(low, low)])
     lost = np.zeros((len(N), int((power <= UNDETERMINED * power[-1]).sum())))
     lost[low] = unit[low, None] * vectors[:, power <= UNDETERMINED * power[-1]]
     weight = np.where((order <= DECISIVE_ORDER) | (group < 0), unit, 0.0)
     return replace(
-        blank, value=value[:n], root=own[:n], shared=shared[:n], open=lost[:n], size=weight[:n], tau=best.tau,
-        falloff=best.falloff, factor=factor,
+        blank, value=value[:n], root=own[:n], shared=shared[:n], open=lost[:n], size=weight[:n], tau=found.size,
+        falloff=found.exponent, factor=factor,
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Posterior:
-    """Coefficients in scaled units, covariance H' H, size of the prior of each group, and its exponent p in n^-p."""
-
-    value: Array
-    half: Array
-    tau: dict[int, float]
-    falloff: float
-    evidence: float
-
-
-def _with_falloff(N: Array, b: Array, unit: Array, order: Array, group: Array, p: float) -> _Posterior:
-    """Return the coefficients for priors ``tau n^-p``, tau of each group by expectation maximisation."""
-    shape = np.where(group >= 0, np.maximum(order, 1.0) ** -p, 1.0)
-    groups = {int(g): np.flatnonzero(group == g) for g in np.unique(group[group >= 0])}
-    least = {g: 1e-3 * float(np.median(unit[members])) for g, members in groups.items()}
-    tau = {g: 3e4 * each for g, each in least.items()}
-    for _ in range(PASSES):
-        prior = np.full(len(N), FLAT)
-        for g, members in groups.items():
-            prior[members] = (unit[members] / (tau[g] * shape[members])) ** 2
-        half, log_det = _half_of_inverse(N, prior)
-        x = half.T @ (half @ b)
-        variance = np.einsum("ij,ij->j", half, half)
-        before = dict(tau)
-        for g, members in groups.items():
-            second = (x[members] ** 2 + variance[members]) * (unit[members] / shape[members]) ** 2
-            tau[g] = max(float(np.sqrt(second.mean())), least[g])
-        if all(abs(np.log(tau[g] / before[g])) < SETTLED for g in groups):
-            break
-    evidence = float(b @ x) - log_det + float(np.log(prior).sum())
-    return _Posterior(x, half, tau, p, evidence)
-
-
-def _half_of_inverse(N: Array, prior: Array) -> tuple[Array, float]:
-    """Return H with H' H the inverse of N + diag(prior), scaled for accuracy, and the logarithm of its determinant."""
-    scale = 1 / np.sqrt(np.diag(N) + prior)
-    scaled = N * scale[:, None] * scale
-    np.fill_diagonal(scaled, 1.0 + ROUNDING)
-    # in the order of LAPACK, and in place: copies would take half of the time
-    factor = linalg.cholesky(scaled.T, lower=True, overwrite_a=True, check_finite=False)
-    log_det = 2 * float(np.log(np.diag(factor) / scale).sum())
-    found: Array = linalg.lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
-    found *= scale
-    return found, log_det
 
 
 def _group(error: int) -> int:

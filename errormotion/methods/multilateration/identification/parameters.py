@@ -10,8 +10,8 @@ series of Legendre polynomials over the measured part of its axis, starting with
   these are the rotations of the axis that carries it, and of others with a constant lever.
 
 The number of terms of an error motion follows from the evidence: the coefficient of order k has the prior standard
-deviation tau / k^p, with the tau of each error motion and the common p of largest marginal likelihood (MacKay, Bayesian
-interpolation, Neural Computation 4, 1992). Terms that the targets do not determine keep their prior, so that possible
+deviation tau / k^p, with the tau of each error motion and the common p of largest marginal likelihood
+(`errormotion.estimation.evidence`). Terms that the targets do not determine keep their prior, so that possible
 errors between the targets are included in the uncertainty. Squareness and the slope of positioning have no prior.
 """
 
@@ -27,6 +27,7 @@ from scipy.special import chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.evidence import Posterior, maximum_evidence
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
@@ -38,8 +39,6 @@ FALSE_ALARM = 1e-3
 """Probability of a note on axes that explain the targets' errors."""
 EXPONENTS = (1.0, 2.0, 3.0, 4.0)
 """Possible exponents p of the prior, by which coefficients decrease with their order."""
-_MAX_ITERATIONS = 100
-_TOLERANCE = 0.01
 _POOLED = 1.0
 """Weight, in terms, of the other error motions of the same kind in the size of one."""
 _BLOCK = 4096
@@ -243,12 +242,15 @@ def fit_machine(
     kept = [k for k, term in enumerate(terms) if term.error not in undetermined]
     S = kept + list(range(len(terms), len(N)))
     terms, datum = [terms[k] for k in kept], datum[:, kept]
-    estimates = [_estimate(terms, N[np.ix_(S, S)], b[S], len(influence), square, p) for p in EXPONENTS]
-    estimate = max(estimates, key=lambda each: each.evidence)
-    freedom = 3 * len(position) - 6 - float(estimate.determined.sum())
-    ratio = estimate.residual / max(freedom, 1.0)
+    N, b = N[np.ix_(S, S)], b[S]
+    found, n = _estimate(terms, N, b), len(terms)
+    x, determined = found.value, found.determined[:n]
+    of_sources = x[len(x) - len(influence) :]
+    residual = max(square - 2 * float(b @ x) + float(x @ N @ x), float(of_sources @ of_sources))
+    freedom = 3 * len(position) - 6 - float(determined.sum())
+    ratio = residual / max(freedom, 1.0)
     scale, notes = 1.0, []
-    if freedom > 0 and estimate.residual > chdtri(freedom, FALSE_ALARM):
+    if freedom > 0 and residual > chdtri(freedom, FALSE_ALARM):
         scale = ratio
         notes.append(
             f"The residuals of the targets' errors after the errors of the axes are {np.sqrt(ratio):.3g} times their "
@@ -256,7 +258,7 @@ def fit_machine(
             f"than {max_order}. The uncertainties of the axes are increased accordingly."
         )
     return Parametric(
-        model, terms, estimate.value, scale * estimate.covariance, estimate.determined, undetermined,
+        model, terms, x[:n], scale * found.covariance[:n, :n], determined, undetermined,
         float(np.sqrt(ratio)), freedom, datum, centre, tuple(notes),
     )  # fmt: skip
 
@@ -352,52 +354,16 @@ def _same_effect(terms: list[Term], accepted: list[int], weight: Array) -> Undet
     return Undetermined(f"not distinguishable from {' and '.join(like) or 'a shift'}", like)
 
 
-@dataclass(frozen=True)
-class _Estimate:
-    """Coefficients, covariance, degree of determination (0 to 1), residual sum of squares, and log evidence."""
+def _estimate(terms: list[Term], N: Array, b: Array) -> Posterior:
+    """Return the coefficients of the terms and of the nuisance parameters after them, for the priors of most evidence.
 
-    value: Array
-    covariance: Array
-    determined: Array
-    residual: float
-    evidence: float
-
-
-def _estimate(terms: list[Term], N: Array, b: Array, sources: int, square: float, p: float) -> _Estimate:
-    """Maximise the evidence over tau of every error motion, by expectation and maximisation."""
-    n = len(terms)
-    order = np.array([term.order for term in terms], dtype=float)
-    free = np.array([term.order >= 0 and (term.order > 1 or term.error[1] != term.error[2]) for term in terms])
-    penalised = np.flatnonzero(free)  # terms with a prior
-    names = list(dict.fromkeys(terms[k].error for k in penalised))
-    group = np.array([names.index(terms[k].error) for k in penalised], dtype=np.intp)
-    count = np.bincount(group, minlength=len(names))
-    kind = np.array([int(name[:2] in ("EA", "EB", "EC")) for name in names], dtype=np.intp)
-    shape = np.maximum(order[penalised], 1.0) ** -p
-    # columns scaled to the same size, independent of the units m and rad
-    unit = 1 / np.sqrt(np.diag(N))
-    sizes, right, identity = np.outer(unit, unit), b * unit, np.eye(len(N))
-    scaled = N * sizes
-    guess = np.array([np.median(unit[penalised[kind[group] == k]]) if (kind == k).any() else 1.0 for k in (0, 1)])
-    tau = 30 * guess[kind]
-    for _ in range(_MAX_ITERATIONS):
-        prior = np.zeros(len(N))
-        prior[penalised] = 1 / (tau[group] * shape) ** 2
-        factor = linalg.cho_factor(scaled + np.diag(prior * unit**2))
-        C = linalg.cho_solve(factor, identity, check_finite=False) * sizes
-        x = unit * linalg.cho_solve(factor, right)
-        variance = np.diag(C)
-        second = np.bincount(group, (x[penalised] ** 2 + variance[penalised]) / shape**2, len(names))
-        logs = 2 * np.log(tau)
-        typical = np.exp([logs[kind == k].mean() if (kind == k).any() else 0.0 for k in (0, 1)])
-        before = tau
-        tau = np.sqrt((second + _POOLED * typical[kind]) / (count + _POOLED))
-        if np.abs(np.log(tau / before)).max(initial=0.0) < _TOLERANCE:
-            break
-    determined = 1 - variance[:n] * prior[:n]
-    # Twice the logarithm of the marginal likelihood, minus a constant.
-    log_det = 2 * float(np.log(np.diag(factor[0])).sum()) - 2 * float(np.log(unit).sum())
-    evidence = float(b @ x) - log_det + float(np.log(prior[prior > 0]).sum())
-    shared = slice(len(N) - sources, len(N))
-    residual = max(square - 2 * float(b @ x) + float(x @ N @ x), float(x[shared] @ x[shared]))
-    return _Estimate(x[:n], C[:n, :n], determined, residual, evidence)
+    Squareness and the slope of positioning have no prior.
+    """
+    free = [term.order >= 0 and (term.order > 1 or term.error[1] != term.error[2]) for term in terms]
+    names = list(dict.fromkeys(term.error for term, penalised in zip(terms, free, strict=True) if penalised))
+    group = np.full(len(N), -1, dtype=np.intp)
+    group[: len(terms)] = [names.index(t.error) if penalised else -1 for t, penalised in zip(terms, free, strict=True)]
+    order = np.zeros(len(N))
+    order[: len(terms)] = [term.order for term in terms]
+    kind = np.array([DOF.index(name[:2]) >= 3 for name in names], dtype=np.intp)  # displacements, rotations
+    return maximum_evidence(N, b, group, order, exponents=EXPONENTS, kind=kind, pooled=_POOLED)

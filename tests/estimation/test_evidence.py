@@ -1,0 +1,131 @@
+"""Coefficients by maximum evidence, against the marginal likelihood of the data, dense algebra, and the truth."""
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+from scipy import stats
+from scipy.optimize import minimize
+
+from errormotion.estimation.evidence import eliminated, maximum_evidence
+
+SIGMA, ORDERS = 0.1, 9
+ORDER = np.concatenate([[0.0], np.arange(1, ORDERS), np.arange(1, ORDERS)])
+GROUP = np.concatenate([[-1], np.zeros(ORDERS - 1), np.ones(ORDERS - 1)]).astype(np.intp)
+"""A constant without prior, and the polynomials of two axes."""
+EXPONENTS = (1.0, 2.0, 3.0)
+
+
+def readings(rng, size, exponent, count=60):
+    """Return design, true coefficients and readings of two polynomials with these sizes."""
+    first, second = (legendre.legvander(rng.uniform(-1, 1, count), ORDERS - 1) for _ in range(2))
+    A = np.column_stack([np.ones(count), first[:, 1:], second[:, 1:]])
+    x = np.concatenate([[5.0], np.repeat(size, ORDERS - 1) * ORDER[1:] ** -exponent * rng.normal(size=2 * ORDERS - 2)])
+    return A, x, A @ x + SIGMA * rng.normal(size=count)
+
+
+def normal(A, y):
+    return A.T @ A / SIGMA**2, A.T @ y / SIGMA**2
+
+
+def log_likelihood(A, y, size, exponent):
+    """Return the logarithm of the marginal likelihood of readings, with a wide prior of the constant."""
+    prior = np.concatenate([[1e2], np.repeat(size, ORDERS - 1) * ORDER[1:] ** -exponent])
+    return stats.multivariate_normal(np.zeros(len(y)), SIGMA**2 * np.eye(len(y)) + (A * prior**2) @ A.T).logpdf(y)
+
+
+def test_sizes_and_exponent_are_those_of_the_largest_marginal_likelihood():
+    A, _, y = readings(np.random.default_rng(1), (1.0, 0.2), 2.0)
+    N, b = normal(A, y)
+    found = maximum_evidence(N, b, GROUP, ORDER, exponents=EXPONENTS, tolerance=1e-8, passes=5000)
+    best = {}
+    for p in EXPONENTS:
+        wanted = minimize(lambda logs, p=p: -log_likelihood(A, y, np.exp(logs), p), [0.0, -1.0], method="Nelder-Mead")
+        best[p] = -wanted.fun
+    assert found.exponent == max(best, key=lambda p: best[p])
+    for p in EXPONENTS:
+        of_p = maximum_evidence(N, b, GROUP, ORDER, exponents=[p], tolerance=1e-8, passes=5000)
+        assert log_likelihood(A, y, of_p.size, p) == pytest.approx(best[p], abs=1e-3)
+        assert found.evidence - of_p.evidence == pytest.approx(2 * (best[found.exponent] - best[p]), abs=4e-3)
+
+
+def test_coefficients_are_those_of_the_posterior():
+    A, _, y = readings(np.random.default_rng(2), (1.0, 0.2), 2.0)
+    N, b = normal(A, y)
+    found = maximum_evidence(N, b, GROUP, ORDER, exponents=[2.0], tolerance=1e-10, passes=5000)
+    precision = np.concatenate([[0.0], (np.repeat(found.size, ORDERS - 1) * ORDER[1:] ** -2.0) ** -2])
+    C = np.linalg.inv(N + np.diag(precision))
+    u = np.sqrt(np.diag(C))
+    assert found.value == pytest.approx(C @ b, abs=1e-6 * u.min())
+    assert found.covariance / np.outer(u, u) == pytest.approx(C / np.outer(u, u), abs=1e-6)
+    assert found.determined == pytest.approx(1 - np.diag(C) * precision, abs=1e-6)
+    assert found.determined[0] == 1.0
+
+
+def test_intervals_contain_the_true_curve_if_the_data_determine_the_sizes():
+    rng, count, held = np.random.default_rng(3), 100, []
+    P = legendre.legvander(np.linspace(-1, 1, 21), ORDERS - 1)[:, 1:]
+    for _ in range(count):
+        A, x, y = readings(rng, (10.0, 5.0), 1.0)
+        found = maximum_evidence(*normal(A, y), GROUP, ORDER, exponents=EXPONENTS)
+        for g in range(2):
+            some = np.flatnonzero(g == GROUP)
+            u = np.sqrt(np.einsum("ij,jk,ik->i", P, found.covariance[np.ix_(some, some)], P))
+            held.append(np.mean(np.abs(P @ (found.value - x)[some]) <= 1.96 * u))
+    # 200 curves of some five independent values: 0.95 to 0.7 %
+    assert 0.93 <= np.mean(held) <= 0.97
+
+
+def test_units_have_no_effect():
+    A, _, y = readings(np.random.default_rng(4), (1.0, 0.2), 2.0)
+    scale = np.where(GROUP == 1, 1e6, 1.0) * np.where(GROUP < 0, 1e-3, 1.0)
+    one, other = (
+        maximum_evidence(*normal(A * s, y), GROUP, ORDER, exponents=EXPONENTS) for s in (np.ones(len(ORDER)), scale)
+    )
+    assert other.value * scale == pytest.approx(one.value, rel=1e-9)
+    assert other.size * [1.0, 1e6] == pytest.approx(one.size, rel=1e-9)
+
+
+def test_an_undetermined_coefficient_keeps_its_prior():
+    """The second axis has been measured at one position: its terms have no effect of their own."""
+    A, _, y = readings(np.random.default_rng(5), (1.0, 0.2), 2.0)
+    A = A.copy()
+    A[:, GROUP == 1] = 0.0
+    N, b = normal(A, y)
+    found = maximum_evidence(
+        N, b, GROUP, ORDER, exponents=[2.0], kind=np.zeros(2, dtype=np.intp), pooled=1.0, passes=3000, tolerance=1e-9,
+        regularisation=1e-13,
+    )  # fmt: skip
+    gone = GROUP == 1
+    assert found.value[gone] == pytest.approx(0.0, abs=1e-12)
+    assert found.determined[gone] == pytest.approx(0.0, abs=1e-6)
+    expected = found.size[1] * ORDER[gone] ** -2.0
+    assert np.sqrt(np.diag(found.covariance))[gone] == pytest.approx(expected, rel=1e-6)
+    # without data, the size of a group becomes the typical one of its kind: that of the other group
+    assert found.size[1] == pytest.approx(found.size[0], rel=1e-3)
+
+
+def test_a_size_is_not_smaller_than_the_smallest():
+    A, _, y = readings(np.random.default_rng(6), (0.0, 0.0), 2.0)
+    N, b = normal(A, y)
+    found = maximum_evidence(N, b, GROUP, ORDER, exponents=[2.0], smallest=5.0, passes=1000)
+    single = 1 / np.sqrt(np.diag(N))
+    least = [5.0 * np.median(single[g == GROUP]) for g in range(2)]
+    assert found.size == pytest.approx(least, rel=1e-9)
+
+
+def test_eliminated_parameters_leave_the_estimate_of_the_others():
+    rng = np.random.default_rng(7)
+    A, y = rng.normal(size=(40, 8)), rng.normal(size=40)
+    N, b, square = A.T @ A, A.T @ y, float(y @ y)
+    N[6:, 6:] += np.eye(2)
+    whole, C = np.linalg.solve(N, b), np.linalg.inv(N)
+    n, right, rest, gain = eliminated(N, b, square, 2)
+    assert np.linalg.solve(n, right) == pytest.approx(whole[:6], rel=1e-10)
+    assert np.linalg.inv(n) == pytest.approx(C[:6, :6], rel=1e-10)
+    assert rest - right @ whole[:6] == pytest.approx(square - b @ whole, rel=1e-10)
+    # the effect of the parameters: what the covariance has less if they are exactly known
+    effect = C[:6, :6] @ gain
+    without = np.linalg.inv(N[:6, :6])
+    assert effect.shape == (6, 2)
+    assert C[:6, :6] - without == pytest.approx(without @ N[:6, 6:] @ C[6:, 6:] @ N[6:, :6] @ without, rel=1e-9)
+    assert eliminated(N, b, square, 0)[3].shape == (8, 0)
