@@ -262,21 +262,25 @@ class Linear:
                 G += _summed(flat, product, R * p * (q + 1)).reshape(R, p, q + 1)
         return band, G[..., :q], D
 
-    def gradient(self, residual: Array) -> tuple[Array, Array]:
-        """Return ``J' r`` for whitened numbers (n, m) or (n, m, k): (R, p[, k]) and (q[, k])."""
+    def gradient(self, residual: Array, rows: Index | None = None) -> tuple[Array, Array]:
+        """Return ``J' r`` for whitened numbers (n, m) or (n, m, k): (R, p[, k]) and (q[, k]).
+
+        With ``rows``, the numbers are those of these readings only.
+        """
+        only: Any = slice(None) if rows is None else rows
         single = residual.ndim == 2
         r = residual[..., None] if single else residual
         k, q = r.shape[2], self.numbering.size
-        product = np.einsum("nmb,nmk->nbk", self.border, r)
-        flat = self.columns[:, :, None] * k + np.arange(k)
+        product = np.einsum("nmb,nmk->nbk", self.border[only], r)
+        flat = self.columns[only][:, :, None] * k + np.arange(k)
         b = _summed(flat, product, (q + 1) * k).reshape(q + 1, k)[:q]
         if self.numbering.local is None:
             a = np.zeros((0, 1, k))
         else:
             block = problem_block(self)
             R, p = block.start.shape
-            product = np.einsum("nmwp,nmk->nwpk", self.local, r)
-            flat = (block.index2[:, :, None, None] * p + np.arange(p)[:, None]) * k + np.arange(k)
+            product = np.einsum("nmwp,nmk->nwpk", self.local[only], r)
+            flat = (block.index2[only][:, :, None, None] * p + np.arange(p)[:, None]) * k + np.arange(k)
             a = _summed(flat, product, R * p * k).reshape(R, p, k)
         return (a[..., 0], b[..., 0]) if single else (a, b)
 

@@ -1,0 +1,456 @@
+"""Outliers, and structural changes such as a ball that moved, by one rule with one rate of false alarms.
+
+The gain of an error in a number, of a reading, or of a candidate is the decrease of the sum of squares if it is
+estimated as well (`effects`). Without the error it has a chi-square distribution with k degrees of freedom; with an
+unknown noise, ``(gain / k) / ((Q - gain) / (f - k))`` has an F distribution. For a single number the root of the gain
+is Baarda's normalised residual w (Publ. Geodesy 2, 5, 1968); the F-test is that of Pope's tau (NOAA TR NOS 65
+NGS 1, 1976) with the noise from the other readings.
+
+Of all numbers and candidates, the most improbable one is excluded if its probability is below the rate of false alarms
+over their number (Bonferroni), and the search is repeated. The effects of exclusions on other gains are exact for a
+linear model, so that one fit serves several exclusions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtr, chdtrc, chdtri
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.additions import with_linear
+from errormotion.estimation.blocks import Index
+from errormotion.estimation.candidates import Candidate
+from errormotion.estimation.derivatives import column
+from errormotion.estimation.effects import MIN_REDUNDANCY, At, Numbers, reduced, solved, swept
+from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.probability import log_chi2_tail, log_f_tail
+from errormotion.estimation.problem import Problem, Unknown
+
+__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned"]
+
+FALSE_ALARM = 1e-3
+"""Probability of excluding anything from valid data."""
+RIVAL = 6.0
+"""Decrease of the sum of squares by which the worst must exceed another explanation: odds of 20 to 1."""
+CONTRADICTED = 0.01
+"""Probability of the sum of squares below which a stated noise counts as unknown in this search.
+
+Otherwise a noise that is stated too small would make outliers of valid readings.
+"""
+MAX_PASSES = 60
+_TOGETHER = 100
+"""Largest number of suspicious numbers that are compared with one another in a pass."""
+_SIZE = 2e7
+"""Largest size of their array."""
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Exclusion:
+    """What was found.
+
+    Attributes
+    ----------
+    words : str
+    gain : float
+        Decrease of the sum of squares.
+    probability : float
+        Probability of such a gain in any of the tests of valid data; 0 if it is below 1e-300.
+    size : ndarray, (k,)
+        The estimated gross error, in the unit of the residuals, or the unknowns of a candidate.
+    excluded : ndarray of bool, shape of the readings
+        Readings that are not used any more.
+    rivals : tuple of str
+        Other explanations that are hardly less probable. They are excluded as well if the remaining readings determine
+        all unknowns; if not, nothing is excluded.
+    """
+
+    words: str
+    gain: float
+    probability: float
+    size: Array
+    excluded: Flags
+    rivals: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """A fit without outliers.
+
+    Attributes
+    ----------
+    fit : Fit
+        Of the problem without what was excluded, and with the unknowns that were added.
+    made : tuple of Exclusion
+    undecided : tuple of Exclusion
+        Contradictions that remain: what is wrong is not determined, or without it the unknowns would not be.
+    unchecked : ndarray of bool, (n, m)
+        Used numbers that no other reading checks.
+    """
+
+    fit: Fit
+    made: tuple[Exclusion, ...]
+    undecided: tuple[Exclusion, ...]
+    unchecked: Flags
+
+    @property
+    def excluded(self) -> Flags:
+        """All excluded readings, in the shape of the readings."""
+        found = np.zeros(self.fit.problem.readings.shape, dtype=bool)
+        for each in self.made:
+            found |= each.excluded
+        return found
+
+
+def cleaned(
+    problem: Problem,
+    *,
+    suspects: Callable[[Fit], Iterable[Candidate]] | None = None,
+    whole: bool = False,
+    false_alarm: float = FALSE_ALARM,
+    name: Callable[[Index], str] | None = None,
+    refresh: Callable[[Problem, Any], Problem] | None = None,
+    what: str = "the readings",
+) -> Cleaned:
+    """Fit a problem and exclude its outliers.
+
+    Parameters
+    ----------
+    problem : Problem
+    suspects : callable, optional
+        Returns structural candidates for a fit; see `steps`.
+    whole : bool
+        Whether all numbers of a vector reading are wrong together. They are if the residuals are not one for each
+        number of a reading.
+    false_alarm : float
+        Probability of excluding anything from valid data.
+    name : callable, optional
+        From the index of a number (reading, number), or of a reading (reading,), to its name in messages.
+    refresh, what
+        See `fit`.
+
+    Raises
+    ------
+    FitError
+        As `fit`; or the search does not end.
+    """
+    search = _Search(problem, suspects, whole, false_alarm, name or _numbered, refresh, what)
+    return search.run()
+
+
+@dataclass(frozen=True, eq=False)
+class _Structure:
+    """A candidate with its size, gain and number of determined unknowns."""
+
+    candidate: Candidate
+    size: Array
+    gain: float
+    k: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Suspect:
+    """A number or a whole reading without which the others agree, given the other suspects."""
+
+    at: At
+    size: Array
+    gain: float
+    chance: float
+    rivals: tuple[At, ...]
+
+
+@dataclass(eq=False)
+class _Search:
+    """One search; the state is what was found.
+
+    A contradiction without a culprit is taken out of the search, as if its worst number were excluded.
+    """
+
+    problem: Problem
+    suspects: Callable[[Fit], Iterable[Candidate]] | None
+    whole: bool
+    false_alarm: float
+    name: Callable[[Index], str]
+    refresh: Callable[[Problem, Any], Problem] | None
+    what: str
+    made: list[Exclusion] = field(default_factory=list)
+    undecided: list[Exclusion] = field(default_factory=list)
+    barred: set[str] = field(default_factory=set)
+
+    def run(self) -> Cleaned:
+        found = self.fitted(self.problem)
+        self.whole = self.whole or found.linear.used.shape != column(self.problem.readings).shape
+        open_ = np.zeros(self.problem.readings.shape, dtype=bool)
+        for _ in range(MAX_PASSES):
+            better, more = self.searched(found)
+            open_ |= more
+            if better is None:
+                if open_.any():
+                    readings = np.where(open_, self.problem.readings, found.problem.readings)
+                    found = self.fitted(replace(found.problem, readings=readings), found)
+                unchecked = found.linear.used & (Numbers(found, self.whole).redundancy <= MIN_REDUNDANCY)
+                return Cleaned(found, tuple(self.made), tuple(self.undecided), unchecked)
+            found = better
+        raise FitError(
+            f"more than {MAX_PASSES} searches for outliers among {self.what} have found more of them; check units, "
+            "the order of the readings and their stated noise"
+        )
+
+    def fitted(self, problem: Problem, before: Fit | None = None) -> Fit:
+        """Return the fit of a problem, from the solution of one with the same unknowns or one table less."""
+        start = None
+        if before is not None:
+            more = [block.start for block in problem.unknowns[len(before.problem.unknowns) :]]
+            start = Unknown([*before.linear.at.tables, *more], before.linear.at.adjusted)
+        return fit(problem, refresh=self.refresh, what=self.what, start=start)
+
+    def searched(self, found: Fit) -> tuple[Fit | None, Flags]:
+        """Return the fit after the most improbable exclusions, None if there are none; and what is undecided."""
+        none = np.zeros(self.problem.readings.shape, dtype=bool)
+        if found.freedom < 1:
+            return None, none
+        numbers = Numbers(found, self.whole)
+        structures = self.structures(found)
+        trials = int(numbers.tested.sum()) + sum(each.candidate.trials for each in structures)
+        largest = max((each.gain for each in structures), default=0.0)
+        search = _Sequence(found, numbers, largest, float(np.log(self.false_alarm / max(trials, 1))))
+        suspects, noise = search.suspects(), search.noise
+        structures.sort(key=lambda each: noise.chance(each.gain, each.k))
+        if structures:
+            chance = noise.chance(structures[0].gain, structures[0].k)
+            if chance < search.limit:
+                # What a single number explains as well is a single number: it excludes less.
+                suspects = [each for each in suspects if each.chance <= chance + RIVAL / 2]
+                if not suspects:
+                    return self.structured(found, structures, chance, trials, noise.unit), none
+        return self.excluded(found, suspects, trials) if suspects else (None, none)
+
+    def structures(self, found: Fit) -> list[_Structure]:
+        """Return the candidates with their effects."""
+        listed = []
+        for each in () if self.suspects is None else self.suspects(found):
+            J = each.design[:, None, :] if each.design.ndim == 2 else each.design
+            white = found.linear.whitener @ J
+            size, gain, rank = solved(*reduced(found, white), 1e-6 * float(np.vdot(white, white)))
+            if rank and np.linalg.norm(size) >= each.smallest and each.words not in self.barred:
+                listed.append(_Structure(each, size, float(gain), int(rank)))
+        return listed
+
+    def excluded(self, found: Fit, suspects: list[_Suspect], trials: int) -> tuple[Fit, Flags]:
+        """Return the fit without these numbers, and those of them that are undecided."""
+        wrong = np.zeros(self.problem.readings.shape, dtype=bool)
+        open_ = wrong.copy()
+        for each in suspects:
+            out = self.flags(each.at)
+            for at in each.rivals:
+                out |= self.flags(at)
+            one = Exclusion(
+                words=self.words(each.at),
+                gain=each.gain,
+                probability=_probability(each.chance, trials),
+                size=each.size,
+                excluded=out,
+                rivals=tuple(self.words(at) for at in each.rivals),
+            )
+            if each.rivals and not self.possible(found, wrong | out):
+                self.undecided.append(replace(one, excluded=np.zeros_like(out)))
+                open_ |= self.flags(each.at)
+            else:
+                self.made.append(one)
+                wrong |= out
+        return self.fitted(found.problem.without(wrong | open_), found), open_
+
+    def structured(self, found: Fit, structures: list[_Structure], chance: float, trials: int, unit: float) -> Fit:
+        """Return the fit without the readings of the best candidate, or with its unknowns."""
+        best = structures[0]
+        candidate = best.candidate
+        out = np.zeros(self.problem.readings.shape, dtype=bool)
+        if candidate.excluded is not None:
+            out |= candidate.excluded.reshape(-1, *[1] * (out.ndim - 1))
+        one = Exclusion(
+            words=candidate.words,
+            gain=best.gain,
+            probability=_probability(chance, trials),
+            size=best.size,
+            excluded=out,
+            rivals=tuple(each.candidate.words for each in structures[1:] if each.gain > best.gain - RIVAL * unit),
+        )
+        if candidate.excluded is None:
+            problem = with_linear(found.problem, f"added_{len(self.made) + 1}", candidate.design, group=one.words)
+        else:
+            problem = found.problem.without(out)
+        self.barred.add(candidate.words)
+        try:
+            better = self.fitted(problem, found)
+        except FitError:
+            self.undecided.append(replace(one, excluded=np.zeros_like(out)))
+            return found
+        self.made.append(one)
+        return better
+
+    def flags(self, at: At) -> Flags:
+        """Return the readings that are excluded with a number."""
+        found = np.zeros(self.problem.readings.shape, dtype=bool)
+        found[at[:1] if self.whole or found.ndim == 1 else at] = True
+        return found
+
+    def words(self, at: At) -> str:
+        """Return the name of a number."""
+        return self.name(np.array(at[:1] if self.whole or self.problem.readings.ndim == 1 else at))
+
+    def possible(self, found: Fit, wrong: Flags) -> bool:
+        """Return whether the readings without ``wrong`` determine all unknowns."""
+        try:
+            self.fitted(found.problem.without(wrong), found)
+        except FitError:
+            return False
+        return True
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """The noise by which gains are judged: as stated, or from the sum of squares and its degrees of freedom."""
+
+    known: bool
+    stated: bool
+    square: float
+    freedom: int
+
+    @property
+    def unit(self) -> float:
+        """The variance that gains have without effect."""
+        return 1.0 if self.known or self.freedom < 1 else self.square / self.freedom
+
+    def chance(self, gain: float, k: int) -> float:
+        """Return the logarithm of the probability of a gain, which the sum of squares contains, of k unknowns."""
+        if not gain > 0:
+            return 0.0
+        plain = float(log_chi2_tail(np.array(gain), k))
+        if self.known:
+            return plain
+        rest = self.freedom - k
+        if rest < 1:
+            return 0.0
+        scale = max((self.square - gain) / rest, 1e-15 * gain / k)
+        found = float(log_f_tail(np.array(gain / k / scale), k, rest))
+        return max(found, plain) if self.stated else found
+
+    def without(self, gain: float, k: int) -> _Noise:
+        """Return the noise once a gain is excluded."""
+        return replace(self, square=max(self.square - gain, 0.0), freedom=self.freedom - k)
+
+
+class _Sequence:
+    """The sequence of numbers that decrease the sum of squares most, each after those before.
+
+    Several outliers hide each other in the scatter that they cause. Therefore the sequence is followed further than the
+    first number that is not improbable, and all numbers up to the last improbable one are suspects (Rosner,
+    Technometrics 25 (1983) 165: generalised extreme Studentised deviate). A suspect that is not improbable once all
+    others are excluded is none.
+    """
+
+    def __init__(self, fit: Fit, numbers: Numbers, of_structure: float, limit: float) -> None:
+        self.numbers, self.k, self.limit = numbers, numbers.k, limit
+        stated = fit.problem.noise.stated
+        self.noise = _Noise(stated, stated, fit.chi2, fit.freedom)
+        self.where = list[At]()
+        gain = np.where(numbers.tested, numbers.gain, 0.0)
+        consistent = stated and chdtrc(fit.freedom, fit.chi2) > CONTRADICTED
+        if not gain.size or (consistent and self.noise.chance(float(gain.max()), self.k) >= limit):
+            return
+        n, m = numbers.W.shape[:2]
+        several = int(min(_TOGETHER, max(_SIZE / (n * m * self.k), 1)))
+        order = np.argsort(gain, axis=None)[::-1][:several]
+        self.where = [(int(o) // gain.shape[1], int(o) % gain.shape[1]) for o in order if gain.flat[o] > 0]
+        self.u, self.N = reduced(fit, numbers.columns(self.where))
+        self.floor = MIN_REDUNDANCY * np.array([numbers.weight(at) for at in self.where])
+        self.order = self._followed(min(len(self.where), max(fit.freedom // (4 * self.k), 1)))
+        if stated:
+            self.noise = replace(self.noise, known=self._as_stated(of_structure))
+
+    def suspects(self) -> list[_Suspect]:
+        """Return the improbable numbers, each given the others, largest gain first."""
+        if not self.where:
+            return []
+        noise, last = self.noise, 0
+        for count, (_, gain) in enumerate(self.order, start=1):
+            if noise.chance(gain, self.k) < self.limit:
+                last = count
+            noise = noise.without(gain, self.k)
+        chosen = [j for j, _ in self.order[:last]]
+        while chosen:
+            found = [self._given(j, [i for i in chosen if i != j]) for j in chosen]
+            worst = max(range(len(chosen)), key=lambda i: found[i].chance)
+            if found[worst].chance < self.limit:
+                return sorted(found, key=lambda each: -each.gain)
+            del chosen[worst]
+        return []
+
+    def _as_stated(self, of_structure: float) -> bool:
+        """Return whether the readings without the sequence, or without one outlier or change, scatter as stated.
+
+        Without the share a of the largest squares of k numbers, the expected sum of the others is smaller by
+        ``F_(k+2)(q) / (1 - a)``, with the distribution function F of chi-square and ``F_k(q) = 1 - a``.
+        """
+        square, freedom = self.noise.square, self.noise.freedom
+        rest = freedom - self.k * len(self.order)
+        share = self.k * len(self.order) / freedom
+        if rest < 1 or share >= 1:
+            return True
+        usual = chdtr(self.k + 2, chdtri(self.k, share)) / (1 - share)
+        left = max(square - sum(gain for _, gain in self.order), 0.0) / usual
+        other = max(square - max(of_structure, self.order[0][1]), 0.0)
+        return bool(max(chdtrc(rest, left), chdtrc(freedom - self.k, other)) > CONTRADICTED)
+
+    def _part(self, j: int) -> slice:
+        return slice(j * self.k, (j + 1) * self.k)
+
+    def _effects(self, u: Array, N: Array) -> tuple[Array, Array]:
+        """Return sizes (K, k) and gains (K,) of all numbers."""
+        count = len(self.where)
+        own = N.reshape(count, self.k, count, self.k)[np.arange(count), :, np.arange(count)]
+        size, gain, _ = solved(u.reshape(count, self.k), own, self.floor)
+        return size, gain
+
+    def _followed(self, count: int) -> list[tuple[int, float]]:
+        """Return the first numbers of the sequence with their gains."""
+        u, N = self.u, self.N
+        found = list[tuple[int, float]]()
+        for _ in range(count):
+            gain = self._effects(u, N)[1]
+            gain[[j for j, _ in found]] = 0.0
+            j = int(np.argmax(gain))
+            found.append((j, float(gain[j])))
+            u, N = swept(u, N, self._part(j))
+        return found
+
+    def _given(self, j: int, others: list[int]) -> _Suspect:
+        """Return a number given that others are excluded, with its rivals."""
+        u, N, noise = self.u, self.N, self.noise
+        for i in others:
+            part = self._part(i)
+            noise = noise.without(float(solved(u[part], N[part, part])[1]), self.k)
+            u, N = swept(u, N, part)
+        size, gain = self._effects(u, N)
+        gain[others] = 0.0
+        its = float(gain[j])
+        least = max(its - RIVAL * noise.without(its, self.k).unit, 0.0)
+        rivals = tuple(self.where[i] for i in np.flatnonzero(gain > least) if i != j)
+        error = self.numbers.root(self.where[j]) @ size[j] if self.numbers.whole else size[j]
+        return _Suspect(self.where[j], error, its, noise.chance(its, self.k), rivals)
+
+
+def _probability(chance: float, trials: int) -> float:
+    """Return the probability of a chance in any of several tests, from its logarithm for one."""
+    return float(np.exp(min(chance + np.log(trials), 0.0)))
+
+
+def _numbered(at: Index) -> str:
+    return f"reading {at[0] + 1}" if at.size == 1 else f"number {at[1] + 1} of reading {at[0] + 1}"
