@@ -10,9 +10,9 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
-from errormotion.estimation.candidates import Candidate, steps
-from errormotion.estimation.effects import Numbers, information
-from errormotion.estimation.exclusions import FALSE_ALARM, Cleaned, cleaned
+from errormotion.estimation.checks.candidates import Candidate, steps
+from errormotion.estimation.checks.effects import Numbers, information
+from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -261,7 +261,7 @@ def test_a_candidate_whose_exclusion_leaves_an_unknown_undetermined_is_reported(
 
 
 def test_an_endless_search_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("errormotion.estimation.exclusions.MAX_PASSES", 1)
+    monkeypatch.setattr("errormotion.estimation.checks.exclusions.MAX_PASSES", 1)
     y = np.random.default_rng(12).standard_normal(30)
     y[5] += 50
     with pytest.raises(FitError, match="more than 1 searches"):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
-from errormotion.estimation.effects import information, solved
+from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.fit import Fit
 
 __all__ = ["Candidate", "steps"]

@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from errormotion.estimation.probability import log_chi2_tail, log_f_tail
+from errormotion.estimation.checks.probability import log_chi2_tail, log_f_tail
 
 X = np.array([0.0, 0.3, 4.0, 50.0, 800.0, 1250.0])
 

@@ -25,11 +25,11 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Index
-from errormotion.estimation.candidates import Candidate
+from errormotion.estimation.checks.candidates import Candidate
+from errormotion.estimation.checks.effects import MIN_REDUNDANCY, At, Numbers, reduced, solved, swept
+from errormotion.estimation.checks.probability import log_chi2_tail, log_f_tail
 from errormotion.estimation.derivatives import column
-from errormotion.estimation.effects import MIN_REDUNDANCY, At, Numbers, reduced, solved, swept
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.probability import log_chi2_tail, log_f_tail
 from errormotion.estimation.problem import Problem, Unknown
 
 __all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned"]
