@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from errormotion.estimation.true_curves import draw_components, draw_curves, draw_variances
+from errormotion.estimation.extremes.true_curves import draw_components, draw_curves, draw_variances
 
 TRIALS = 400
 Z = np.linspace(-1, 1, 30)

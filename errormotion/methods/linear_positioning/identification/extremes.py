@@ -6,7 +6,7 @@ Its distribution given the readings is found by simulation (JCGM 101). In each t
 
 * variances are drawn from their scaled inverse chi-square distributions;
 * the mean curve and the reversal curve are drawn as a line plus a remainder that is shrunk by the share of noise in it
-  (`errormotion.estimation.true_curves`), as are the logarithms of variances that differ from target to target;
+  (`errormotion.estimation.extremes.true_curves`), as are the logarithms of variances that differ from target to target;
 * drift from run to run shifts and inclines both curves, and each source of the budget is drawn once.
 
 The figure of the standard exceeds the median of the trials by the ``bias``. The bias depends on the assumption of how
@@ -23,7 +23,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.estimation.extremes import SEED, Extremes, by_true_values
-from errormotion.estimation.true_curves import draw_components, draw_curves, draw_variances
+from errormotion.estimation.extremes.true_curves import draw_components, draw_curves, draw_variances
 from errormotion.methods.linear_positioning.identification import standard
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import Statistics

@@ -9,7 +9,7 @@ not correct for this ``bias``. Two estimates of it:
     to the standard deviation of the noise, so that it is ``d / (sqrt(2) - 1)``; that of a curve with pointed extremes
     is proportional to the variance, so that it is d. The first is stated.
 `by_true_values`, by draws of the true values
-    For curves whose departures from a line are alike at all positions, for which `errormotion.estimation.true_curves`
+    For curves whose departures from a line are alike at all positions: `errormotion.estimation.extremes.true_curves`
     draws the true curve given the readings. The bias is the excess over the median of the figures of these draws.
 
 A bias depends on assumptions about the curve. Half of it is added to the standard deviation of the figure as its

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.estimation.smoothing_basis import Basis, Series, groups_alike, mixed, weigh
+from errormotion.estimation.smoothing.basis import Basis, Series, groups_alike, mixed, weigh
 
 ORDER = 3
 """Order of a curve with enough points."""
