@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -18,10 +19,13 @@ from errormotion.kinematics.twists import adjoint
 
 @dataclass(frozen=True)
 class Placed:
-    """Errors of one dataset at n points as arrays: values (n, 6), covariance (n, 6, 6), influence (source, n, 6)."""
+    """Errors of one dataset at n points as arrays: values (n, 6), own (n, 6, 6), influence (source, n, 6).
+
+    ``own`` is the covariance of contributions that are independent between points, without the sources.
+    """
 
     value: Array
-    total: Array
+    own: Array
     influence: Array
     source: list[str]
     identity: list[str]
@@ -33,8 +37,9 @@ class Placed:
         F = influence_of(ds)
         source = [str(each) for each in ds["source"].values.tolist()] if len(F) else []
         identity = ds["source_id"].values.tolist() if len(F) and "source_id" in ds.coords else [""] * len(F)
-        total = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6)
-        return cls(value, total, F.reshape(len(F), len(value), 6), source, [str(each) for each in identity])
+        F = F.reshape(len(F), len(value), 6)
+        own = np.asarray(ds["covariance"].values, dtype=float).reshape(-1, 6, 6) - products(F)
+        return cls(value, own, F, source, [str(each) for each in identity])
 
     @property
     def seen(self) -> list[str]:
@@ -43,39 +48,53 @@ class Placed:
 
     def at_times(self, time: Array, grid: Array) -> Placed:
         """Return the errors at other times."""
-        E, C, F, _ = interpolated(
-            np.asarray(time, dtype=float), self.value, self.total, self.influence, grid, starting=True
-        )
-        return replace(self, value=E, total=C, influence=F)
+        total = self.own + products(self.influence)
+        E, C, F, _ = interpolated(np.asarray(time, dtype=float), self.value, total, self.influence, grid, starting=True)
+        return replace(self, value=E, own=C - products(F), influence=F)
 
     def since_first(self) -> Placed:
         """Return the changes since the first point."""
-        E, C, F, further = changes(self.value, self.total, self.influence, np.arange(len(self.value)) == 0)
-        return Placed(E, C, F, [*self.source, *further], [*self.identity, *[""] * len(further)])
+        total = self.own + products(self.influence)
+        E, C, F, further = changes(self.value, total, self.influence, np.arange(len(self.value)) == 0)
+        names, ids = [*self.source, *further], [*self.identity, *[""] * len(further)]
+        return Placed(E, C - products(F), F, names, ids)
 
     def times(self, A: Array) -> Placed:
-        """Return the errors multiplied by matrices (6, 6) or (n, 6, 6).
+        """Return the errors multiplied by a matrix (6, 6), or by matrices (n, 6, 6).
 
         An unknown rotation counts as 0 where it acts by a lever, and makes a freedom unknown where it replaces it.
         """
-        T = np.broadcast_to(A, (len(self.value), 6, 6))
-        block = (T != 0).astype(float)
-        block[:, :3, 3:] = block[:, 3:, :3] = 0.0
-        gone = np.matmul(block, np.isnan(self.value)[..., None].astype(float))[..., 0] > 0
-        value = np.where(gone, np.nan, np.matmul(T, filled(self.value)[..., None])[..., 0])
-        total = np.matmul(np.matmul(T, filled(self.total)), np.swapaxes(T, 1, 2))
-        total[gone[:, :, None] | gone[:, None, :]] = np.nan
-        influence = np.matmul(T, filled(self.influence)[..., None])[..., 0]
-        influence[:, gone] = np.nan
-        return replace(self, value=value, total=total, influence=influence)
+        value, own, influence, unknown = self._filled
+        block = np.zeros_like(A)
+        block[..., :3, :3], block[..., 3:, 3:] = A[..., :3, :3] != 0, A[..., 3:, 3:] != 0
+        if A.ndim == 2:  # one product of large matrices, instead of one of small ones at each point
+            gone = unknown @ block.T > 0
+            own = (own.reshape(-1, 36) @ np.kron(A, A).T).reshape(-1, 6, 6)
+            value, influence = value @ A.T, influence @ A.T
+        else:
+            gone = np.matmul(block, unknown[..., None])[..., 0] > 0
+            own = np.matmul(np.matmul(A, own), np.swapaxes(A, 1, 2))
+            value, influence = (np.matmul(A, each[..., None])[..., 0] for each in (value, influence))
+        if gone.any():
+            value[gone] = np.nan
+            own[gone[:, :, None] | gone[:, None, :]] = np.nan
+            influence[:, gone] = np.nan
+        return replace(self, value=value, own=own, influence=influence)
+
+    @cached_property
+    def _filled(self) -> tuple[Array, Array, Array, Array]:
+        """Values, own and influence with 0 for unknown ones, and which values are unknown (1)."""
+        return filled(self.value), filled(self.own), filled(self.influence), np.isnan(self.value).astype(float)
 
     def estimate(self, name: str, freedoms: Sequence[str]) -> Estimate:
         """Return freedoms as an estimate; sources without an identity are specific to this dataset."""
+        keys = tuple(
+            identity or f"{name}: {source}" for identity, source in zip(self.identity, self.source, strict=True)
+        )
+        if tuple(freedoms) == tuple(DOF):
+            return Estimate(name, self.value, self.own, self.influence, keys)
         k = [DOF.index(freedom) for freedom in freedoms]
-        F = self.influence[..., k]
-        own = self.total[:, k][:, :, k] - products(F)
-        keys = (identity or f"{name}: {source}" for identity, source in zip(self.identity, self.source, strict=True))
-        return Estimate(name, self.value[:, k], own, F, tuple(keys))
+        return Estimate(name, self.value[:, k], self.own[:, k][:, :, k], self.influence[..., k], keys)
 
 
 def _unchanged(placed: Placed) -> Placed:
@@ -110,9 +129,28 @@ class Stored:
 
     def changed(self, A: Array) -> Placed:
         """Return the errors on common ground if the stated ones are multiplied by matrices (6, 6) or (n, 6, 6)."""
-        return self.finish(self.placed.times(self.transfer @ A @ adjoint(shift=-self.shift)))
+        return self.finish(self.placed.times(self._from_own(A)))
 
-    @property
+    def values(self, A: Array) -> Array:
+        """Return the values (n, 6) of `changed`."""
+        return self.finish(self._exact.times(self._from_own(A))).value
+
+    def _from_own(self, A: Array) -> Array:
+        """Return matrices that act at the functional point of the dataset as those that act at the common one."""
+        found: Array = self.transfer @ A @ self._back
+        return found
+
+    @cached_property
+    def _exact(self) -> Placed:
+        """The errors without uncertainty."""
+        each = self.placed
+        return Placed(each.value, np.zeros_like(each.own), each.influence[:0], [], [])
+
+    @cached_property
     def transfer(self) -> Array:
         """Matrix (6, 6) from the functional point of the dataset to the common one."""
         return adjoint(shift=self.shift)
+
+    @cached_property
+    def _back(self) -> Array:
+        return adjoint(shift=-self.shift)

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from errormotion import datasets
 from errormotion.compare import compare
+from errormotion.compare.placed import Placed, Stored
 from errormotion.compare.report import part
 from errormotion.compare.text import cause_text, verdict
 from errormotion.datasets import DOF
@@ -181,3 +183,18 @@ def test_points_without_a_known_value_are_unknown_and_not_0(contradiction):
     shown = part(found, "k")
     cells = [figure.value.text for figure in shown.key_figures if figure.label == "Largest |En|"]
     assert cells == ["unknown"]
+
+
+@pytest.mark.parametrize("unknown", [(), (1,), (1, 5)])
+def test_one_matrix_for_all_points_is_the_same_as_one_at_each_point(unknown):
+    """An unknown rotation is 0 at a lever, and makes the freedoms unknown that it replaces."""
+    each = Placed.of(made("a", np.random.default_rng(9)))
+    each.value[4, list(unknown)] = each.own[4, list(unknown)] = each.own[4, :, list(unknown)] = np.nan
+    turn = Rotation.from_rotvec([0.1, -0.2, 0.05])
+    for A in (factor(("EB",), -1.0), swapped(1, 2), twists.adjoint(shift=[0.1, 0.2, -0.3]), twists.adjoint(turn)):
+        one, other = each.times(A), each.times(np.broadcast_to(A, (T.size, 6, 6)))
+        for name in ("value", "own", "influence"):
+            found, expected = getattr(one, name), getattr(other, name)
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15 * np.nanmax(np.abs(expected), initial=0))
+        moved = Stored(each, np.array([0.1, 0.0, -0.2]))
+        np.testing.assert_array_equal(moved.values(A), moved.changed(A).value)

@@ -99,3 +99,39 @@ def test_a_value_that_is_exactly_zero_is_no_evidence():
     own[0], F[:, 0] = 0.0, 0.0
     own[3, 2], own[3, :, 2], F[:, 3, 2] = np.nan, np.nan, np.nan
     assert whitener(own, F).degrees == N * D - D - 1
+
+
+def test_a_direction_that_has_no_variance_at_any_point_is_left_out():
+    """A change of one stated freedom has one direction at the common functional point, the same at all points."""
+    rng = np.random.default_rng(7)
+    direction = np.array([1.0, -2.0, 0.5]) * SCALE
+    root = np.multiply.outer(rng.uniform(0.5, 2.0, N), direction)[..., None]
+    F = np.multiply.outer(rng.normal(size=(2, N)), direction)
+    white = whitener(root @ np.swapaxes(root, 1, 2), F)
+    assert white.degrees == N
+    a, z = rng.normal(size=N), rng.normal(size=2)
+    values = a[:, None] * root[..., 0] + np.tensordot(z, F, axes=1)
+    # in units of the direction the covariance is that of N scalars
+    size, f = np.linalg.norm(root[..., 0] / SCALE, axis=1), F[..., 0] / direction[0] * np.linalg.norm(direction / SCALE)
+    V = np.diag(size**2) + f.T @ f
+    y = a * size + z @ f
+    assert white.square(values) == pytest.approx(y @ np.linalg.solve(V, y), rel=1e-9)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.999, 1 - 1e-9, 1.0])
+def test_a_factor_of_a_nearly_singular_block_is_that_of_its_eigenvectors(correlation):
+    """From a Cholesky factor to eigenvectors to a direction without variance: one value, whatever the way."""
+    block = np.array([[1.0, correlation, 0], [correlation, 1.0, 0], [0, 0, 1.0]]) * np.outer(SCALE, SCALE)
+    own = np.tile(np.diag(SCALE**2), (N, 1, 1))
+    own[3] = block
+    along, across = np.array([1.0, 1, 0]) * SCALE, np.array([1.0, -1, 0]) * SCALE
+    white = whitener(own, np.zeros((0, N, D)))
+    assert white.degrees == N * D - (correlation == 1)
+    value = np.zeros((N, D))
+    value[3] = along
+    assert white.square(value) == pytest.approx(2 / (1 + correlation), rel=1e-9)
+    if correlation < 1:
+        value[3] = across
+        assert white.square(value) == pytest.approx(2 / (1 - correlation), rel=1e-6)
+        expected = np.log(np.linalg.det(block / np.outer(SCALE, SCALE))) + 2 * N * np.log(SCALE).sum()
+        assert white.log_determinant == pytest.approx(expected, rel=1e-9)

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from errormotion.arrays import Array, products
+from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, measured, reference_weights
 from errormotion.compare.chain.straightness import TABLE, TOOL, at_reference, from_line, levers
 from errormotion.compare.chain.volume import SAME, predict
@@ -104,13 +104,11 @@ def on_axis(
 
 
 def _placed(curve: Curve) -> Placed:
-    total = curve.own + products(curve.influence)
-    return Placed(curve.value, total, curve.influence, curve.source, curve.identity)
+    return Placed(curve.value, curve.own, curve.influence, curve.source, curve.identity)
 
 
 def _curve(each: Placed) -> Curve:
-    own = each.total - products(each.influence)
-    return Curve(each.value, own, each.influence, each.source, [""] * len(each.source), each.identity)
+    return Curve(each.value, each.own, each.influence, each.source, [""] * len(each.source), each.identity)
 
 
 def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:

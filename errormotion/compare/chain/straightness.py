@@ -80,13 +80,9 @@ def from_line(placed: Placed, positions: Array, axis: str) -> Placed:
     """Return the errors with straightness relative to the line through the first and the last known position."""
     weights = np.nan_to_num(reference_weights([placed.value], positions, axis))
     weights[:, :, [k for k in range(6) if not is_straightness(k, axis)]] = 0.0
-    own = filled(placed.total) - np.einsum("sni,snj->nij", filled(placed.influence), filled(placed.influence))
-    curve = Curve(
-        placed.value, own, placed.influence, placed.source, [""] * len(placed.source), placed.identity
-    ).relative(weights)
-    F = filled(curve.influence)
-    total = curve.own + np.einsum("sni,snj->nij", F, F)
-    return Placed(curve.value, total, curve.influence, curve.source, curve.identity)
+    own, F = filled(placed.own), placed.influence
+    curve = Curve(placed.value, own, F, placed.source, [""] * len(placed.source), placed.identity).relative(weights)
+    return Placed(curve.value, curve.own, curve.influence, curve.source, curve.identity)
 
 
 def _straight(ds: xr.Dataset) -> list[str]:

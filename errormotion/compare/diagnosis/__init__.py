@@ -16,9 +16,11 @@ changes the errors of a dataset changes their noise as well: it is named only if
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy import special
@@ -41,6 +43,8 @@ SELECTIONS = 3
 """Largest number of selections of the sizes that differ from 0."""
 SETTLED = 0.05
 """Step in units of its standard uncertainty that ends them."""
+WORST_CONDITION = 1e10
+"""Condition number of scaled normal equations above which their sizes are not determined."""
 SMALL = 1e-6
 """Difference of a parameter for a derivative."""
 
@@ -101,7 +105,7 @@ class _Difference:
 class _Found:
     """A fitted cause: gain, penalty of its sizes and choices, probability of the residuals.
 
-    ``change`` is the change of one dataset by the correction, with the covariance that its own noise gives it.
+    ``change`` returns the change of one dataset by the correction, with the covariance that its own noise gives it.
     """
 
     name: str
@@ -109,7 +113,7 @@ class _Found:
     gain: float
     penalty: float
     p: float
-    change: Estimate | None = None
+    change: Callable[[], Estimate] | None = None
 
 
 def diagnose(
@@ -161,7 +165,7 @@ def diagnose(
         score = float(found.gain - found.penalty - prior)
         kind = _kind(candidate)
         best = by_kind[kind].score if kind in by_kind else 0.0
-        if score > best and (found.change is None or _significant(found.change)):
+        if score > best and (found.change is None or _significant(found.change())):
             by_kind[kind] = Cause(found.name, found.sizes, found.gain / 2, score, found.p)  # the best one of a search
     causes = sorted(by_kind.values(), key=lambda each: -each.score)
     return [_with_alike(cause, causes) for cause in causes]
@@ -186,8 +190,7 @@ def _fitted(candidate: AnyCause, given: _Difference) -> _Found | None:
 
 def _added(candidate: Added, given: _Difference) -> _Found | None:
     effects = np.where(np.isfinite(given.d.value), np.nan_to_num(candidate.effects), 0.0)
-    normal = given.white.product(effects, effects)
-    gradient = given.white.product(effects, given.d.value[None])[:, 0]
+    normal, gradient = given.white.normal(effects, given.d.value)
     best = _best(normal, gradient, candidate.choices, given.count)
     if best is None:
         return None
@@ -214,7 +217,7 @@ def _mapped(candidate: Mapped, given: _Difference) -> _Found | None:
         return None
     if not every:
         p = _p(state.white.degrees, state.rest)
-        return _Found(candidate.name, (), state.gain, 0.0, p, _change(candidate, state.beta))
+        return _Found(candidate.name, (), state.gain, 0.0, p, partial(_change, candidate, state.beta))
     used: list[int] = []
     for _ in range(SELECTIONS):
         # The covariance at the sizes found decides which of them differ from 0.
@@ -238,7 +241,7 @@ def _mapped(candidate: Mapped, given: _Difference) -> _Found | None:
     )
     penalty = _penalty(len(used), len(candidate.choices), given.count)
     p = _p(state.white.degrees - len(used), state.rest)
-    return _Found(candidate.name, sizes, state.gain, penalty, p, _change(candidate, state.beta))
+    return _Found(candidate.name, sizes, state.gain, penalty, p, partial(_change, candidate, state.beta))
 
 
 def _refined(candidate: Mapped, given: _Difference, used: Sequence[int]) -> _Corrected:
@@ -300,14 +303,15 @@ def _corrected(candidate: Mapped, given: _Difference, beta: Array) -> _Corrected
 
 def _normal(candidate: Mapped, state: _Corrected, used: Sequence[int]) -> tuple[Array, Array]:
     """Return the normal equations for a change of the parameters ``used``."""
-    effects = []
+    effects, known = [], np.isfinite(state.d.value)
     for i in used:
         h = SMALL * np.eye(len(state.beta))[i]
         slope = (candidate.matrix(state.beta + h) - candidate.matrix(state.beta - h)) / (2 * SMALL)
-        effect = candidate.side.sign * candidate.side.corrected(slope).value
-        effects.append(np.where(np.isfinite(state.d.value), np.nan_to_num(effect), 0.0))
+        effect = candidate.side.sign * candidate.side.effect(slope)
+        effects.append(np.where(known, effect, 0.0))
     G = np.array(effects).reshape(len(used), *state.d.value.shape)
-    return state.white.product(G, G), -state.white.product(G, state.d.value[None])[:, 0]
+    normal, gradient = state.white.normal(G, state.d.value)
+    return normal, -gradient
 
 
 def _improved(
@@ -328,7 +332,7 @@ def _read(candidate: Read) -> _Found:
     first, second = (whitener(each.own, each.influence) for each in (before, after))
     rest = second.square(after.value)
     gain = first.square(before.value) - rest + first.log_determinant - second.log_determinant
-    return _Found(candidate.name, (), gain, 0.0, _p(second.degrees, rest), candidate.change)
+    return _Found(candidate.name, (), gain, 0.0, _p(second.degrees, rest), lambda: candidate.change)
 
 
 def _shifted(candidate: Shifted, given: _Difference) -> _Found | None:
@@ -348,29 +352,31 @@ def _best(
     most = -np.inf
     for choice in choices:
         used = list(choice)
-        if (solved := _sizes(normal[np.ix_(used, used)], gradient[used])) is None:
+        if (solved := _sizes(normal[used][:, used], gradient[used])) is None:
             continue
         beta, C, gain = solved
-        if gain - len(used) * np.log(count) > most:
-            most, found = gain - len(used) * np.log(count), (used, beta, C, gain)
+        if (score := gain - _penalty(len(used), 1, count)) > most:
+            most, found = score, (used, beta, C, gain)
     return found
 
 
 def _sizes(normal: Array, gradient: Array) -> tuple[Array, Array, float] | None:
     """Return sizes, their covariance, and the decrease of the sum of squares; None if they are not determined."""
-    scale = np.sqrt(np.diag(normal))
-    if not (scale > 0).all():
+    diagonal = normal.diagonal()
+    if not diagonal.min() > 0:
         return None
-    unit = normal / np.outer(scale, scale)
-    if np.linalg.cond(unit) > 1e10:
+    scale = np.sqrt(diagonal)
+    power, vectors = np.linalg.eigh(normal / (scale[:, None] * scale))
+    if power[-1] > WORST_CONDITION * power[0]:
         return None
-    C = np.linalg.inv(unit) / np.outer(scale, scale)
+    vectors /= scale[:, None]
+    C = (vectors / power) @ vectors.T
     beta = C @ gradient
     return beta, C, float(beta @ gradient)
 
 
 def _penalty(sizes: int, trials: int, count: int) -> float:
-    return float(sizes * np.log(count) + 2 * np.log(trials))
+    return sizes * math.log(count) + 2 * math.log(trials)
 
 
 def _p(degrees: int, square: float) -> float:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from errormotion.arrays import Array
+from errormotion.arrays import Array, filled
 from errormotion.compare.diagnosis.shift import Course, smooth
 from errormotion.compare.placed import Placed, Stored
 from errormotion.compare.stack import Estimate
@@ -59,6 +60,17 @@ class Side:
     def corrected(self, A: Array) -> Estimate:
         """Return the estimate if the stated errors are multiplied by matrices."""
         return self.estimate(self.stored.changed(A))
+
+    def effect(self, A: Array) -> Array:
+        """Return the compared freedoms (n, d) of the stated errors multiplied by matrices; unknown values are 0."""
+        return filled(self.stored.values(A)[:, [DOF.index(name) for name in self.freedoms]])
+
+    @cached_property
+    def stated(self) -> list[str]:
+        """Freedoms that the dataset states and that affect the compared ones."""
+        k = [DOF.index(name) for name in self.freedoms]
+        acts = np.abs(self.stored.transfer[k]).max(axis=0) > 0
+        return [name for name, each in zip(DOF, acts, strict=True) if each and name in self.stored.placed.seen]
 
 
 @dataclass(frozen=True)
@@ -160,7 +172,7 @@ def _functional_points(a: Side, b: Side) -> Iterator[Mapped]:
     for side, name in (
         [(a, "functional point")] if compared else [(each, f"functional point of '{each.name}'") for each in (a, b)]
     ):
-        effects = [_effect(side, adjoint(shift=axis) - np.eye(6)) for axis in np.eye(3)]
+        effects = [side.effect(adjoint(shift=axis) - np.eye(6)) for axis in np.eye(3)]
         used = [axis for axis in range(3) if np.abs(effects[axis]).max(initial=0.0) > 0]
         if not used:
             continue
@@ -190,10 +202,10 @@ def _frames(a: Side, b: Side) -> Iterator[Mapped]:
 
 def _scales(a: Side, b: Side) -> Iterator[Mapped]:
     for side, suffix in _places(a, b):
-        parts = {"the displacements": DOF[:3], "the rotations": DOF[3:]} | {name: (name,) for name in _stated(side)}
+        parts = {"the displacements": DOF[:3], "the rotations": DOF[3:]} | {name: (name,) for name in side.stated}
         for what, names in parts.items():
             inside = np.isin(DOF, names)
-            if np.abs(_effect(side, np.diag(inside.astype(float)))).max(initial=0.0) > 0:
+            if np.abs(side.effect(np.diag(inside.astype(float)))).max(initial=0.0) > 0:
 
                 def matrix(gain: Array, inside: NDArray[np.bool_] = inside) -> Array:
                     return np.diag(np.where(inside, 1.0 + gain[0], 1.0))
@@ -210,7 +222,7 @@ def _factor(gain: Array, u: Array) -> tuple[Array, Array]:
 
 def _signs(a: Side, b: Side) -> Iterator[Mapped]:
     for side, suffix in _places(a, b):
-        for name in _stated(side):
+        for name in side.stated:
             turned = np.diag(np.where(np.isin(DOF, name), -1.0, 1.0))
             yield Mapped("sign", f"sign of {name}{suffix}", side, _always(turned))
 
@@ -218,7 +230,7 @@ def _signs(a: Side, b: Side) -> Iterator[Mapped]:
 def _exchanges(a: Side, b: Side) -> Iterator[Mapped]:
     for side, suffix in _places(a, b, "in"):
         for names in (DOF[:3], DOF[3:]):
-            for one, other in combinations([name for name in names if name in _stated(side)], 2):
+            for one, other in combinations([name for name in names if name in side.stated], 2):
                 i, j = DOF.index(one), DOF.index(other)
                 swap = np.eye(6)
                 swap[[i, j]] = swap[[j, i]]
@@ -228,7 +240,7 @@ def _exchanges(a: Side, b: Side) -> Iterator[Mapped]:
 def _units(a: Side, b: Side) -> Iterator[Mapped]:
     for names, factors in ((DOF[:3], FACTORS), (DOF[3:], TURNS)):
         for side in (a, b):
-            if not set(names) & set(_stated(side)):
+            if not set(names) & set(side.stated):
                 continue
             for what, factor in factors.items():
                 back = np.diag(np.where(np.isin(DOF, names), 1 / factor, 1.0))
@@ -274,7 +286,7 @@ def _profile(
     """Yield errors with one profile (n,), in some of the freedoms that a dataset states."""
     places = _places(a, b)
     for side, suffix in places:
-        names = _stated(side)
+        names = side.stated
         columns = side.stored.transfer[
             np.ix_([DOF.index(each) for each in side.freedoms], [DOF.index(n) for n in names])
         ]
@@ -300,18 +312,6 @@ def _freedom_sets(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
     ]
     singles = [(i,) for i in range(len(names))]
     return tuple(dict.fromkeys([*singles, *(part for part in parts if part)]))
-
-
-def _stated(side: Side) -> list[str]:
-    """Return the freedoms that a dataset states and that affect the compared ones."""
-    k = [DOF.index(name) for name in side.freedoms]
-    acts = np.abs(side.stored.transfer[k]).max(axis=0) > 0
-    return [name for name, each in zip(DOF, acts, strict=True) if each and name in side.stored.placed.seen]
-
-
-def _effect(side: Side, A: Array) -> Array:
-    """Return the effect (n, d) of a matrix on the compared freedoms of a dataset; unknown values have none."""
-    return np.nan_to_num(side.corrected(A).value)
 
 
 def _always(A: Array) -> Callable[[Array], Array]:

@@ -122,12 +122,11 @@ def fitted(course: Course, sign: float, time: Array, difference: Array, white: W
     for _ in range(REFINEMENTS):
         step = max(MIN_SHIFT, 0.02 * abs(shift))
         slope = (effect(shift + step) - effect(shift - step)) / (2 * step)
-        both = np.stack([slope, difference - effect(shift)])
-        normal = white.product(both, both)
+        normal, gradient = white.normal(slope[None], difference - effect(shift))
         information = float(normal[0, 0])
         if not information > 0:
             return None
-        move = float(normal[0, 1]) / information
+        move = float(gradient[0]) / information
         while abs(move) > 0.01 / np.sqrt(information):
             square = white.square(difference - effect(shift + move))
             if square < least:
