@@ -112,7 +112,7 @@ def _drift_numbers(machine: VirtualMachine, errors: xr.Dataset, clock: float, se
             what = f"E{axis} step, compensation of {axis} switched off"
             [corrected] = machine.state.correction_at([clock + zero + 60 * event.minute])
             true_step = float(corrected["XYZ".index(axis)])
-            numbers.append(Number(what, 1e6 * step.step, 1e6 * 2 * step.u_step, 1e6 * true_step, "um"))
+            numbers.append(Number(what, 1e6 * step.step, 2e6 * step.u_step, 1e6 * true_step, "um"))
     return numbers
 
 

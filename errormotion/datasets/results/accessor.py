@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion import plugins
 from errormotion.arrays import Array
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
     from errormotion.datasets.results.plotting.figure import Form
+    from errormotion.estimation.extremes import Extremes, Largest
 
 INDEPENDENT = "independent"
 """Name of the independent contribution in a budget."""
@@ -276,6 +278,52 @@ class ErrorMotion:
             xr.DataArray(E, dims=(*rest, "dof"), coords=self._coords("dof", without=dim), name="value"),
             xr.DataArray(C, dims=(*rest, "dof", "dof_"), coords=self._coords("dof", "dof_", without=dim)),
         )
+
+    def largest(self, *names: str, among: ArrayLike | None = None) -> Largest | None:
+        """Return the largest error of one freedom, or the longest vector of several, over all places.
+
+        The largest of noisy values is too large on average; its expanded uncertainty contains this bias.
+
+        Parameters
+        ----------
+        names : str
+            One or more of `names`.
+        among : array_like of bool, optional
+            Places, of the shape of the errors; default all. Only places where all of ``names`` are known are used.
+
+        Returns
+        -------
+        Largest or None
+            ``place`` is a flat index; None if no place is known.
+        """
+        from errormotion.estimation.extremes import largest
+
+        places, e, C, F = self._known(names, among)
+        if not places.size:
+            return None
+        found = largest(e, C, F)
+        return replace(found, place=int(places[found.place]))
+
+    def root_mean_square(self, *names: str) -> Extremes | None:
+        """Return the root mean square of one freedom, or of the length of several, over all places where it is known.
+
+        Noise makes it too large on average, as of `largest`. None if no place is known.
+        """
+        from errormotion.estimation.extremes import root_mean_square
+
+        places, e, C, F = self._known(names)
+        return root_mean_square(e, C, F) if places.size else None
+
+    def _known(
+        self, names: Sequence[str], among: ArrayLike | None = None
+    ) -> tuple[NDArray[np.intp], Array, Array, Array]:
+        """Return flat places where all ``names`` are known; their errors, independent covariance and influence."""
+        index = [self.names.index(name) for name in names]
+        e = self._values()[..., index].reshape(-1, len(index))
+        places = np.flatnonzero(np.isfinite(e).all(axis=1) & (True if among is None else np.ravel(among)))
+        F = self._influence()[..., index].reshape(-1, *e.shape)[:, places]
+        C = self._covariance()[..., index, :][..., index].reshape(-1, len(index), len(index))[places]
+        return places, e[places], C - np.einsum("sti,stj->tij", F, F), F
 
     def since(self, time: float | tuple[float, float]) -> xr.Dataset:
         """Return the changes since an instant, or since the mean of an interval; see `reduction.since`."""

@@ -129,6 +129,74 @@ def range_from_reference(values: Array, variance: Array, shared: Array) -> Extre
     return of_noisy_values(_range, values, np.sqrt(variance), shared)
 
 
+@dataclass(frozen=True)
+class Largest:
+    """The largest of noisy errors, or lengths of error vectors.
+
+    Attributes
+    ----------
+    place : int
+        Its index.
+    value : float
+        With the sign of the error; a length is not negative.
+    bias : float
+        Typical excess of its magnitude over the true largest one, and over the true one at its place.
+    u : float
+        Standard uncertainty of the magnitude less the bias.
+    """
+
+    place: int
+    value: float
+    bias: float
+    u: float
+
+    @property
+    def expanded(self) -> float:
+        """Expanded uncertainty of ``value``, k = 2; see `expanded`."""
+        return float(expanded(self.bias, self.u))
+
+
+def largest(errors: Array, covariance: Array, shared: Array) -> Largest:
+    """Return the largest of errors, or the longest of error vectors.
+
+    Parameters
+    ----------
+    errors : ndarray, (n, m)
+        Finite; n > 0.
+    covariance : ndarray, (n, m, m)
+        Of the contributions that are independent from place to place.
+    shared : ndarray, (source, n, m)
+        Effect of one standard uncertainty of each source that the places share.
+    """
+    length = np.linalg.norm(errors, axis=-1)
+    place = int(length.argmax())
+    value = float(errors[place, 0] if errors.shape[1] == 1 else length[place])
+    found = _of_lengths(lambda lengths: lengths.max(axis=-1), errors, covariance, shared)
+    return Largest(place, value, float(found.bias), float(found.u))
+
+
+def root_mean_square(errors: Array, covariance: Array, shared: Array) -> Extremes:
+    """Return the root mean square of errors, or of the lengths of error vectors; parameters as of `largest`."""
+    return _of_lengths(lambda lengths: np.sqrt(np.mean(lengths**2, axis=-1)), errors, covariance, shared)
+
+
+def _of_lengths(figure: Callable[[Array], Array], errors: Array, covariance: Array, shared: Array) -> Extremes:
+    """Return a figure of lengths (..., n) with bias and uncertainty; NaN where a covariance is unknown.
+
+    Lengths are the same in the principal axes of the covariances, in which the coordinates are independent.
+    """
+
+    def figures(e: Array) -> Array:
+        return np.asarray(figure(np.linalg.norm(e, axis=-1)))
+
+    if not (np.isfinite(covariance).all() and np.isfinite(shared).all()):
+        return Extremes(figures(errors), np.asarray(np.nan), np.asarray(np.nan))
+    variances, axes = np.linalg.eigh(covariance)
+    u = np.sqrt(np.maximum(variances, 0.0))  # those that are negative by rounding are 0
+    turned = np.einsum("tji,...tj->...ti", axes, np.concatenate([errors[None], shared]))
+    return of_noisy_values(figures, turned[0], u, turned[1:])
+
+
 def by_true_values(value: Array, true: Array) -> Extremes:
     """Return figures with their bias and uncertainty, by the figures of draws of the true values.
 

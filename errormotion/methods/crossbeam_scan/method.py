@@ -23,7 +23,7 @@ class CrossbeamScan:
         id="crossbeam_scan",
         summary="Six thermal errors of a crossbeam's axis from repeated scans of artefacts with a line profiler",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "errors of the cold machine: all errors are relative to the cold scans",
             "motion of the table and its artefacts together with the crossbeam",

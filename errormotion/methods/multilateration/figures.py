@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import xarray as xr
 
+from errormotion.estimation.extremes import expanded
+from errormotion.kinematics.iso import DOF
 from errormotion.plugins import FigureOfMerit
 
 
@@ -15,23 +17,28 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
     return [*_volumetric(errors), *_squareness(errors)]
 
 
+def root_mean_square(errors: xr.Dataset) -> tuple[float, float]:
+    """Return the root mean square volumetric error of the known targets, and its U (k = 2), m."""
+    mean = errors.em.root_mean_square(*DOF[:3])
+    e = np.stack([errors[name].values for name in DOF[:3]], axis=-1)
+    variance = np.einsum("ti,tij,tj->t", e, errors["covariance"].values[:, :3, :3], e)[np.isfinite(e).all(axis=1)]
+    value = float(mean.value)
+    # For any correlation of the errors of targets, an upper limit of u, to first order.
+    most = float(np.mean(np.sqrt(variance))) / value if value > 0 else 0.0
+    return value, float(expanded(mean.bias, np.maximum(mean.u, most)))
+
+
 def _volumetric(errors: xr.Dataset) -> Iterator[FigureOfMerit]:
     if errors["EX"].dims != ("target",) or errors["covariance"].dims[:-2] != ("target",):
         return
-    e = np.stack([errors[name].values for name in ("EX", "EY", "EZ")], axis=-1)
-    C = errors["covariance"].values[:, :3, :3]
-    size = np.linalg.norm(e, axis=1)
-    known = np.isfinite(size) & (size > 0)
-    if not known.any():
+    largest = errors.em.largest(*DOF[:3])
+    if largest is None or not largest.value > 0:
         return
-    e, C, size = e[known], C[known], size[known]
-    sigma = np.sqrt(np.einsum("ti,tij,tj->t", e, C, e)) / size
-    worst, rms = int(np.argmax(size)), float(np.sqrt(np.mean(size**2)))
-    name = errors["target"].values[known][worst] if "target" in errors.coords else np.flatnonzero(known)[worst] + 1
-    yield FigureOfMerit(f"largest volumetric error, target {name}", float(size[worst]), 2 * float(sigma[worst]), "m")
-    # For any correlation of the errors of targets, an upper limit of u of the root mean square, to first order.
-    spread = float(np.mean(size * sigma)) / rms
-    yield FigureOfMerit(f"root mean square volumetric error, {len(size)} targets", rms, 2 * spread, "m")
+    targets = errors["target"].values if "target" in errors.coords else np.arange(1, errors.sizes["target"] + 1)
+    name = f"largest volumetric error, target {targets[largest.place]}"
+    yield FigureOfMerit(name, largest.value, largest.expanded, "m")
+    known = int(np.isfinite(errors["EX"].values).sum())
+    yield FigureOfMerit(f"root mean square volumetric error, {known} targets", *root_mean_square(errors), "m")
 
 
 def _squareness(errors: xr.Dataset) -> Iterator[FigureOfMerit]:

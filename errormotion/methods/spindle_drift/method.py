@@ -23,7 +23,7 @@ class SpindleDrift:
         id="spindle_drift",
         summary="Spindle drift with five sensors on a bar, ISO 230-3: beam detection and drift",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "the rotation about the spindle axis (EC)",
             "errors within one turn of the spindle, which are averaged out",

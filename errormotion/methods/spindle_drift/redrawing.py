@@ -51,7 +51,7 @@ def _drift(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing
         "unseen_rotation": 0.0,
         "noise": "stated",
     }
-    sigma = noise(raw, averages, settings, [])
+    sigma = noise(raw, record, settings, [])
     _, _, covariance, group = beams_of(raw, settings, [])
     sources = {"readings": _readings(sigma), group: _beams(covariance, settings.beams, group)}
     if settings.bar_radius_uncertainty:

@@ -142,10 +142,10 @@ def table(dataset: xr.Dataset, caption: str, reasons: Mapping[str, str] | None =
             lost = Cell(DASH, reason=(reasons or {}).get(name, "not determined by this method"))
             rows.append([name, unit, *[lost] * 5, count])
             continue
-        most, last = int(np.nanargmax(np.abs(values))), int(known[-1])
+        most, last = dataset.em.largest(name), int(known[-1])
         spans = [fixed(finite(f, values), 2, signed=True) for f in (np.min, np.max)]
-        largest, ending = (estimate(values[k], expanded[k]) for k in (most, last))
-        rows.append([name, unit, *spans, largest, fixed(time[most] / 60, 1), ending, count])
+        largest, ending = estimate(most.value / size, most.expanded / size), estimate(values[last], expanded[last])
+        rows.append([name, unit, *spans, largest, fixed(time[most.place] / 60, 1), ending, count])
     head = ["error", "unit", "lowest", "highest", "largest", "at / min", "last known", "known"]
     return Table(f"{caption} After ±: expanded uncertainty, k = 2.", head, rows)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -66,22 +64,14 @@ def _sigma(errors: xr.Dataset, index: int) -> np.ndarray:
     return np.asarray(budget.sigma(errors)[..., index])
 
 
-def _worst(errors: xr.Dataset, index: int) -> tuple[float, float]:
-    """Value and standard uncertainty in SI where a freedom's error is largest; NaN where it is unknown."""
-    values = errors[errors.em.names[index]].values.ravel()
-    if not np.isfinite(values).any():
-        return math.nan, math.nan
-    place = int(np.nanargmax(np.abs(values)))
-    return float(values[place]), float(_sigma(errors, index).ravel()[place])
-
-
 def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     names, found = names_of(errors), []
     for i, freedom in enumerate(errors.em.names):
         unit, size = unit_of(i)
-        value, sigma = _worst(errors, i)
-        if math.isfinite(value):
-            found.append(KeyFigure(names[freedom], estimate(value / size, 2 * sigma / size), unit, "largest"))
+        largest = errors.em.largest(freedom)
+        if largest is not None:
+            cell = estimate(largest.value / size, largest.expanded / size)
+            found.append(KeyFigure(names[freedom], cell, unit, "largest"))
     return found
 
 

@@ -48,13 +48,21 @@ def _value(seen: Campaign, cycle: int, artefact: int, i: int) -> Cell:
     return estimate(seen.values[cycle, artefact, i] / size, 2 * seen.sigma[cycle, artefact, i] / size, reason=reason)
 
 
+def _largest(seen: Campaign, i: int) -> Cell:
+    size, largest = unit_of(i)[1], seen.extreme(i)
+    if largest is None:
+        return Cell("—", reason="not observed by this method")
+    return estimate(largest.value / size, largest.expanded / size)
+
+
 def _key_figures(seen: Campaign) -> list[KeyFigure]:
     found = []
     for i, freedom in enumerate(FREEDOMS):
         place = seen.largest(i)
         if place is not None:
-            cell = _value(seen, *place, i)
-            found.append(KeyFigure(f"largest {seen.names[freedom]}", cell, unit_of(i)[0], seen.where(*place)))
+            found.append(
+                KeyFigure(f"largest {seen.names[freedom]}", _largest(seen, i), unit_of(i)[0], seen.where(*place))
+            )
     planned, made = crossbeam_quality.made(seen)
     lost = crossbeam_quality.lost(seen) or "none missing, none refused"
     found.append(KeyFigure("registrations made", Cell(integer(made)), f"of {integer(planned)}", lost))
@@ -75,7 +83,7 @@ def _summary(seen: Campaign) -> list[str]:
     at = seen.largest(largest)
     if at is not None and shown is not None:
         name = seen.names[FREEDOMS[largest]]
-        value = _with_unit(_value(seen, *at, largest), unit_of(largest)[0])
+        value = _with_unit(_largest(seen, largest), unit_of(largest)[0])
         words.append(f"The largest displacement is {name}: {value} ({seen.where(*at)}).")
         words += _last_change(seen, largest, at[1])
     words += _holes(seen)
@@ -96,8 +104,8 @@ def _summary(seen: Campaign) -> list[str]:
 
 
 def _extent(seen: Campaign, i: int) -> float:
-    place = seen.largest(i)
-    return abs(float(seen.values[(*place, i)])) if place is not None else -1.0
+    largest = seen.extreme(i)
+    return abs(largest.value) if largest is not None else -1.0
 
 
 def _procedure(seen: Campaign) -> str:

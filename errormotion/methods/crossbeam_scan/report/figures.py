@@ -22,10 +22,10 @@ def figures(errors: xr.Dataset) -> list[FigureOfMerit]:
 def _largest(errors: xr.Dataset) -> list[FigureOfMerit]:
     seen, found = campaign(errors), []
     for i, freedom in enumerate(FREEDOMS):
-        at = seen.largest(i)
-        if at is not None:
+        at, largest = seen.largest(i), seen.extreme(i)
+        if at is not None and largest is not None:
             name = f"largest {seen.names[freedom]} at {seen.where(*at)}".replace("\u00a0", " ")
-            found.append(FigureOfMerit(name, float(seen.values[at][i]), 2 * float(seen.sigma[at][i]), _unit(i)))
+            found.append(FigureOfMerit(name, largest.value, largest.expanded, _unit(i)))
     return found
 
 

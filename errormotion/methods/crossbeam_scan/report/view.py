@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.estimation.extremes import Largest
 from errormotion.kinematics.iso import iso_names
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.fields import field
@@ -58,6 +60,7 @@ class Campaign:
     sigma: Array
     reason: NDArray[np.str_]
     reference: NDArray[np.bool_]
+    _extremes: dict[int, Largest | None] = dataclasses.field(default_factory=dict, repr=False)
 
     @property
     def names(self) -> dict[str, str]:
@@ -93,11 +96,21 @@ class Campaign:
 
     def largest(self, freedom: int) -> tuple[int, int] | None:
         """Return (cycle, artefact) of the largest error of a freedom when warm; None where it is unknown."""
-        size = np.where(self.reference[:, None], np.nan, np.abs(self.values[..., freedom]))
-        if not np.isfinite(size).any():
+        found = self.extreme(freedom)
+        if found is None:
             return None
-        cycle, artefact = np.unravel_index(int(np.nanargmax(size)), size.shape)
-        return int(cycle), int(artefact)
+        dims = self.errors.em.dims
+        place = np.unravel_index(found.place, [self.errors.sizes[dim] for dim in dims])
+        cycle, artefact = (int(place[dims.index(dim)]) for dim in AXES)
+        return cycle, artefact
+
+    def extreme(self, freedom: int) -> Largest | None:
+        """Return the largest error of a freedom when warm, with its bias by noise; None where it is unknown."""
+        if freedom not in self._extremes:
+            em = self.errors.em
+            among = xr.DataArray(np.broadcast_to(~self.reference[:, None], self.values.shape[:2]), dims=AXES)
+            self._extremes[freedom] = em.largest(FREEDOMS[freedom], among=among.transpose(*em.dims))
+        return self._extremes[freedom]
 
     def shown(self) -> tuple[int, int] | None:
         """Return (cycle, artefact) of the registration to show: the last of the artefact with the largest error.

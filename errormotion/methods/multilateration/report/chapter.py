@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
+from errormotion.kinematics.iso import DOF
+from errormotion.methods.multilateration.figures import root_mean_square
 from errormotion.methods.multilateration.report import axes, drawings, plan, quality
 from errormotion.methods.multilateration.report.view import Network, is_multilateration, network, scalar
 from errormotion.report import budget, provenance
@@ -66,16 +68,17 @@ def part(source: Source, key: str) -> Part:
         sections.append(Section("quality", "Remarks", _remarks(errors)))
     sections.append(Section("provenance", "Provenance", provenance.blocks(source)))
     title = "Expected uncertainty of a multilateration" if planned else "Volumetric errors by multilateration"
-    return Part(title, _key_figures(net, planned), _summary(errors, net, planned), sections)
+    return Part(title, _key_figures(errors, net, planned), _summary(errors, net, planned), sections)
 
 
-def _key_figures(net: Network, planned: bool) -> list[KeyFigure]:
+def _key_figures(errors: xr.Dataset, net: Network, planned: bool) -> list[KeyFigure]:
     found = []
-    if not planned and net.worst is not None:
-        value = estimate(1e6 * net.length[net.worst], 2e6 * _along(net, net.worst), signed=False)
-        found.append(KeyFigure("longest error vector", value, "µm", f"at {net.targets[net.worst]}"))
-        rms = 1e6 * float(np.sqrt(finite(np.mean, net.length**2)))
-        found.append(KeyFigure("root mean square", Cell(fixed(rms, 2)), "µm", "of the error vectors"))
+    longest = None if planned else errors.em.largest(*DOF[:3])
+    if longest is not None:
+        value = estimate(1e6 * longest.value, 1e6 * longest.expanded, signed=False)
+        found.append(KeyFigure("longest error vector", value, "µm", f"at {net.targets[longest.place]}"))
+        value = estimate(*(1e6 * each for each in root_mean_square(errors)), signed=False)
+        found.append(KeyFigure("root mean square", value, "µm", "of the error vectors"))
     sigma = net.worst_direction
     if np.isfinite(sigma).any():
         middle = Cell(significant(2e6 * finite(np.median, sigma)))
@@ -86,16 +89,6 @@ def _key_figures(net: Network, planned: bool) -> list[KeyFigure]:
         used = int((np.isfinite(net.residual) & (net.left_out == 0)).sum())
         found.append(KeyFigure("readings", Cell(integer(used)), "", f"used; {integer(out)} ignored"))
     return found
-
-
-def _along(net: Network, target: int) -> float:
-    """Return the standard uncertainty of a target along its error vector, m."""
-    size = net.length[target]
-    if not size > 0:
-        return math.nan
-    way = net.error[target] / size
-    variance = float(way @ net.covariance[target] @ way)
-    return math.sqrt(variance) if variance >= 0 else math.nan
 
 
 def _summary(errors: xr.Dataset, net: Network, planned: bool) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
+from errormotion.estimation.extremes import Largest
 from errormotion.methods.normal_vector.report import drawings
 from errormotion.methods.normal_vector.report.view import MISSING, MOVED, UNDETERMINED, WRONG, Probing, probing
 from errormotion.methods.normal_vector.schema import flag_text
@@ -69,14 +70,11 @@ def part(source: Source, key: str) -> Part:
     )
 
 
-def _strongest(seen: Probing, first: int) -> tuple[int, float] | None:
-    """Return cycle and length, SI, of the largest displacement (0) or rotation (3)."""
-    three = seen.values[:, first : first + 3]
-    length = np.where(np.isfinite(three).any(axis=1), np.sqrt(np.nansum(three**2, axis=1)), np.nan)
-    if not np.isfinite(length).any() or not np.nanmax(length) > 0:
-        return None
-    k = int(np.nanargmax(length))
-    return k, float(length[k])
+def _strongest(errors: xr.Dataset, first: int) -> Largest | None:
+    """Return the largest displacement (0) or rotation (3) by its known freedoms; None where it is always zero."""
+    names = [name for name in FREEDOMS[first : first + 3] if np.isfinite(errors[name].values).any()]
+    found = errors.em.largest(*names) if names else None
+    return found if found is not None and found.value > 0 else None
 
 
 def _when(seen: Probing, cycle: int) -> str:
@@ -115,10 +113,11 @@ def _summary(source: Source, seen: Probing, found: list[sensors.Sensor]) -> list
         + ("all errors are known." if known == cycles else f"the errors of {integer(cycles - known)} are unknown.")
     ]
     for first, what, (unit, size) in ((0, "displacement", unit_at(0)), (3, "rotation", unit_at(3))):
-        strongest = _strongest(seen, first)
+        strongest = _strongest(errors, first)
         if strongest is not None:
-            k, length = strongest
-            words.append(f"The largest {what} is {fixed(length / size, 2)} {unit}, {_when(seen, k)}.")
+            value = estimate(abs(strongest.value) / size, strongest.expanded / size, signed=False)
+            length = f"{value.text} ± {value.uncertainty}" if value.uncertainty else value.text
+            words.append(f"The largest {what} is {length} {unit}, {_when(seen, strongest.place)}.")
     speed, commanded = np.array([]), commanded_speed(source)
     if "spindle_speed" in errors:
         speed = np.abs(np.asarray(errors["spindle_speed"].values, float))

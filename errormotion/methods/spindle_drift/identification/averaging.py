@@ -79,6 +79,21 @@ def window_sums(
     return sums, counts
 
 
+def missing_places(
+    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], counts: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the sums of the places in their windows of the values that are NaN, (channel, window).
+
+    ``counts`` are the numbers of the others, from `window_sums`. The first value of a window has the place 0.
+    """
+    found = np.zeros(counts.shape, np.int64)
+    for channel in np.flatnonzero((counts < np.diff(edges)).any(axis=1)):
+        lost = np.flatnonzero(np.isnan(values[channel, edges[0] : edges[-1]])) + edges[0]
+        window = np.searchsorted(edges, lost, side="right") - 1
+        found[channel] = np.bincount(window, weights=lost - edges[window], minlength=counts.shape[1])
+    return found
+
+
 def _groups(samples: NDArray[np.int64]) -> Iterator[slice]:
     """Yield slices of the windows: all but the first and the last one where these are of one length, else blocks."""
     middle = samples[1:-1]
@@ -118,12 +133,15 @@ class Averages:
         Number of valid samples.
     expected : ndarray, int64, (window,)
         Number of samples, valid or not.
+    lag : ndarray, (channel, window)
+        Mean time of the valid samples minus ``time``, s; 0 where none is missing.
     """
 
     time: Array
     mean: Array
     count: NDArray[np.int64]
     expected: NDArray[np.int64]
+    lag: Array
 
 
 @dataclass(frozen=True)
@@ -159,6 +177,7 @@ class Averager:
         self._index = -1
         self._sum = np.zeros(channels)
         self._count = np.zeros(channels, np.int64)
+        self._missing = np.zeros(channels, np.int64)
         self._time = 0.0
         self._samples = 0
 
@@ -175,7 +194,8 @@ class Averager:
         windows = self.windows(time)
         if windows is None:
             return _samples_as_windows(values_of(time), values)
-        return self.add(time, windows, *window_sums(values, windows.edges, 1))
+        sums, counts = window_sums(values, windows.edges, 1)
+        return self.add(time, windows, sums, counts, missing_places(values, windows.edges, counts))
 
     def windows(self, time: Times) -> Windows | None:
         """Return the windows of the samples at ``time``, the next ones; None where `update` has to have the values."""
@@ -196,24 +216,31 @@ class Averager:
         bounds = np.asarray(self._start + (np.arange(first + 1, last + 1) - self._tolerance) * self._length, np.float64)
         return Windows(first, last, np.concatenate([[0], first_samples(time, bounds), [time.size]]).astype(np.int64))
 
-    def add(self, time: Times, windows: Windows, sums: Array, counts: NDArray[np.int64]) -> Averages:
-        """Add the sums and numbers (channel, window) of values at ``time``; return the complete windows."""
+    def add(
+        self, time: Times, windows: Windows, sums: Array, counts: NDArray[np.int64], missing: NDArray[np.int64]
+    ) -> Averages:
+        """Add the sums and numbers (channel, window) of values at ``time``; return the complete windows.
+
+        ``missing`` are the sums of the places of missing values, from `missing_places`.
+        """
         samples = np.diff(windows.edges)
         times = time_sums(time, windows.edges) + samples * first_and_last(time)[0]
         if self._samples:  # the window that the blocks before have left open goes on, or was their last one
             if windows.first == self._index:
+                missing[:, 0] += self._missing + self._samples * (samples[0] - counts[:, 0])
                 sums[:, 0] += self._sum
                 counts[:, 0] += self._count
                 times[0] += self._time
                 samples[0] += self._samples
             else:
                 sums, counts = np.column_stack([self._sum, sums]), np.column_stack([self._count, counts])
+                missing = np.column_stack([self._missing, missing])
                 times, samples = np.append(self._time, times), np.append(self._samples, samples)
         self._index = windows.last
-        self._sum, self._count = sums[:, -1].copy(), counts[:, -1].copy()
+        self._sum, self._count, self._missing = sums[:, -1].copy(), counts[:, -1].copy(), missing[:, -1].copy()
         self._time, self._samples = float(times[-1]), int(samples[-1])
         done = np.flatnonzero(samples[:-1])
-        return self._averages(sums[:, done], counts[:, done], times[done], samples[done])
+        return self._averages(sums[:, done], counts[:, done], missing[:, done], times[done], samples[done])
 
     def finish(self) -> Averages:
         """Return the last window, if it is long enough to average out the run-out."""
@@ -222,26 +249,41 @@ class Averager:
         if not self._samples or self._samples < _MIN_WINDOW * self._full:
             return self._none()
         last = self._averages(
-            self._sum[:, None], self._count[:, None], np.array([self._time]), np.array([self._samples])
+            self._sum[:, None],
+            self._count[:, None],
+            self._missing[:, None],
+            np.array([self._time]),
+            np.array([self._samples]),
         )
         self._samples = 0
         return last
 
     def _none(self) -> Averages:
         channels = self._sum.size
-        nothing = np.zeros(0, np.int64)
-        return self._averages(np.zeros((channels, 0)), np.zeros((channels, 0), np.int64), np.zeros(0), nothing)
+        none = np.zeros((channels, 0), np.int64)
+        return self._averages(np.zeros((channels, 0)), none, none, np.zeros(0), np.zeros(0, np.int64))
 
-    def _averages(self, total: Array, count: NDArray[np.int64], times: Array, expected: NDArray[np.int64]) -> Averages:
+    def _averages(
+        self,
+        total: Array,
+        count: NDArray[np.int64],
+        missing: NDArray[np.int64],
+        times: Array,
+        expected: NDArray[np.int64],
+    ) -> Averages:
         enough = count >= np.maximum(1, self._minimum * np.maximum(expected, 0.99 * self._full))
         mean = np.where(enough, total / np.maximum(count, 1), np.nan)
-        return Averages(times / np.maximum(expected, 1), mean, count, expected)
+        middle = (expected - 1) / 2
+        place = (expected * middle - missing) / np.maximum(count, 1)  # mean of the valid samples
+        lag = np.where(count > 0, place - middle, 0.0) * (self._length / self._full if self._full else 0.0)
+        return Averages(times / np.maximum(expected, 1), mean, count, expected, lag)
 
 
 def _samples_as_windows(time: Array, values: NDArray[np.floating[Any]]) -> Averages:
     """Return every sample as its own window."""
     counts = np.isfinite(values).astype(np.int64)
-    return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64))
+    nothing = np.zeros(values.shape)
+    return Averages(time.copy(), values.astype(np.float64), counts, np.ones(time.size, np.int64), nothing)
 
 
 def join(parts: list[Averages]) -> Averages:
@@ -251,6 +293,7 @@ def join(parts: list[Averages]) -> Averages:
         np.concatenate([part.mean for part in parts], axis=1),
         np.concatenate([part.count for part in parts], axis=1),
         np.concatenate([part.expected for part in parts]),
+        np.concatenate([part.lag for part in parts], axis=1),
     )
 
 

@@ -98,7 +98,7 @@ def identify_drift(raw: xr.Dataset, settings: Settings, method: str, version: st
     _check_senses(then, bar)
     point = np.round(then.E[0], 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
     errors = twist(state, then, point)
-    sigma = noise(raw, averages, settings, notes)
+    sigma = noise(raw, record, settings, notes)
     sources = [
         *reading_sources(np.sqrt(np.sum(sigma[:, reference] ** 2, axis=1)) / reference.size),
         *beam_sources(bar.origin, bar.direction, bar.covariance, bar.source, calibrated=settings.beams != "nominal"),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets.files.hashing import DatasetHasher, cores
+from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.averaging import (
     COMPILED_SIZE,
@@ -25,6 +26,7 @@ from errormotion.methods.spindle_drift.identification.averaging import (
     Averages,
     Windows,
     join,
+    missing_places,
     slices,
     window_sums,
 )
@@ -59,6 +61,9 @@ class Record:
         degC.
     spindle_speed : ndarray (window,) or None
         1/min.
+    weight : ndarray (5, window)
+        Standard deviation of the noise of a mean relative to that of its valid samples: larger than 1 where samples are
+        missing on one side, so that the mean is carried to the time of the window.
     scatter : ndarray (5,) or None
         Standard deviation of single readings within one mean at steady speed, m; None where the record consists of
         means, or has no spindle speed.
@@ -68,6 +73,7 @@ class Record:
     temperature: Array | None
     spindle_speed: Array | None
     scatter: Array | None
+    weight: Array
 
 
 def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -> Record:
@@ -90,17 +96,69 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     parts.append(averager.finish())
     means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
-    return Record(join(parts), means.get("temperature"), None if speed is None else speed[0], scatter)
+    averages = join(parts)
+    ones = np.ones(averages.mean.shape)
+    record = Record(averages, means.get("temperature"), None if speed is None else speed[0], scatter, ones)
+    return _at_common_times(record, settings)
+
+
+def _at_common_times(record: Record, settings: Settings) -> Record:
+    """Return a record whose means are those at the times of their windows, although samples are missing.
+
+    The mean of a window without its first third is that at a later time. Each is carried back along the slope of the
+    means beside it, but not across a change of speed or of a compensation.
+    """
+    averages = record.averages
+    if not averages.lag.any():
+        return record
+    time = averages.time
+    steady = ~settling(record, settings.spin_up)
+    together = steady[1:] & steady[:-1]
+    first, last = time - settings.average / 2, time + settings.average / 2
+    for event in settings.schedule:
+        together &= (last[1:] <= event.at) | (first[:-1] >= event.at + SWITCHING)
+    mean, weight = averages.mean.copy(), record.weight.copy()
+    for i, lag in enumerate(averages.lag):
+        step = np.diff(time + lag)
+        slope = np.where(together, np.diff(averages.mean[i]) / step, np.nan)
+        pairs = np.flatnonzero(np.isfinite(slope))
+        if not (lag.any() and pairs.size):
+            continue
+        nearest = pairs[np.minimum(np.searchsorted(pairs, np.arange(time.size) - 1), pairs.size - 1)]
+        x = lag / step[nearest]
+        gradient, weight[i] = _gradient(slope, slope[nearest], x)
+        mean[i] -= lag * gradient
+    return replace(record, averages=replace(averages, mean=mean), weight=weight)
+
+
+def _gradient(slope: Array, nearest: Array, x: Array) -> tuple[Array, Array]:
+    """Return the slope of a curve at its points, and the noise of ``y - x step gradient`` relative to that of y.
+
+    ``slope`` (n - 1,) is that between neighbours, NaN where it is not to be used. It is the mean of both sides, of
+    second order on one side, or ``nearest`` (n,).
+    """
+    padded = np.pad(slope, 2, constant_values=np.nan)
+    further_left, left, right, further_right = (padded[k : k + x.size] for k in range(4))
+    sides = [
+        ((left + right) / 2, np.hypot(1.0, x / np.sqrt(2.0))),
+        (1.5 * right - 0.5 * further_right, np.sqrt((1 + 1.5 * x) ** 2 + 4.25 * x**2)),
+        (1.5 * left - 0.5 * further_left, np.sqrt((1 - 1.5 * x) ** 2 + 4.25 * x**2)),
+        (right, np.hypot(1 + x, x)),
+        (left, np.hypot(1 - x, x)),
+        (nearest, np.hypot(1.0, np.sqrt(2.0) * x)),
+    ]
+    known = [np.isfinite(gradient) for gradient, _ in sides]
+    return tuple(np.select(known, list(each)) for each in zip(*sides, strict=True))
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """A slice of a record: its times, values (row, sample), and their sums, None where each sample is a window."""
+    """A slice of a record: its times, values (row, sample), and arguments of `Averager.add` unless each is a window."""
 
     time: Times
     windows: Windows | None
     values: dict[str, NDArray[Any]]
-    sums: dict[str, tuple[Array, NDArray[np.int64]]]
+    sums: dict[str, tuple[Array, NDArray[np.int64], NDArray[np.int64]]]
 
     def added_to(self, averager: Averager, name: str) -> Averages:
         """Return the windows that are complete with this slice."""
@@ -128,7 +186,8 @@ def _pieces(
                 rows = rows[order]
             values[name] = rows
             if windows is not None:
-                sums[name] = window_sums(rows, windows.edges, 1, compiled=compiled)
+                total, counts = window_sums(rows, windows.edges, 1, compiled=compiled)
+                sums[name] = total, counts, missing_places(rows, windows.edges, counts)
         return _Piece(time, windows, values, sums)
 
     last, done = -np.inf, 0
@@ -215,12 +274,13 @@ def length_of_means(averages: Averages, settings: Settings) -> float:
     return settings.average if averages.expected.max() > 1 else 0.0
 
 
-def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[str]) -> Array:
+def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> Array:
     """Return the standard uncertainty (5, instant) of the means, m: as stated, or as observed where that is larger."""
     stated = float(raw["distance_noise"])
+    averages = record.averages
     sigma = stated / np.sqrt(np.maximum(averages.count, 1))
     if settings.noise == "stated":
-        return np.asarray(sigma)
+        return np.asarray(sigma * record.weight)
     for i, channel in enumerate(CHANNELS):
         # Second differences remove the drift, the median removes steps.
         root = np.sqrt(np.maximum(averages.count[i], 1))
@@ -236,7 +296,7 @@ def noise(raw: xr.Dataset, averages: Averages, settings: Settings, notes: list[s
                 f"{stated * 1e6:.3g} um; the uncertainty follows from the observed noise."
             )
             sigma[i] = seen / root
-    return np.asarray(sigma)
+    return np.asarray(sigma * record.weight)
 
 
 def sensors(raw: xr.Dataset) -> list[str]:

@@ -86,7 +86,7 @@ def _summary(source: Source) -> list[str]:
         key=lambda name: -float(np.nanmax(np.abs(found[name].values))),
     )
     if by_size:
-        words += _largest(errors, found[by_size[0]], by_size[0])
+        words += _largest(errors, by_size[0])
     words += _changes(errors, events(source))
     words += _first_hour(errors)
     words += _course(errors, by_size, events(source))
@@ -125,11 +125,16 @@ def _with_uncertainty(value: Cell) -> str:
     return f"{value.text} ± {value.uncertainty}" if value.uncertainty else str(value.text)
 
 
-def _largest(errors: xr.Dataset, line: Curve, name: str) -> list[str]:
-    unit, size = line.unit
+def _largest(errors: xr.Dataset, name: str) -> list[str]:
+    unit, size = unit_of(name)
     time = minutes_of(errors)
-    place = int(np.nanargmax(np.abs(line.values)))
-    value = estimate(line.values[place] / size, 2 * line.uncertainty[place] / size)
+    moved = errors
+    if name != "Z":
+        height = float(errors["level_height"].values["12".index(name[1])])
+        moved = errors.em.at([*np.asarray(errors.attrs["functional_point"], float)[:2], height])
+    largest = moved.em.largest(f"E{name[0]}")
+    place = largest.place
+    value = estimate(largest.value / size, largest.expanded / size)
     return [
         f"The largest displacement is {WHAT[name].removeprefix('displacement ')}: {_with_uncertainty(value)} {unit}, "
         f"reached after {fixed(time[place], 1)} min."
