@@ -225,7 +225,7 @@ class Linear:
             a = np.where(block.freed, a + block.information * (self.at.tables[number.local] - block.start), 0.0)
         prior, offset = self.border_prior()
         D[np.arange(q), np.arange(q)] += prior
-        normal = factorised(band, G, D, self._gauge())
+        normal = factorised(band, G, D, self.gauge())
         return normal, -a, -(b + prior * offset)
 
     def sums(self) -> tuple[list[Array], Array, Array]:
@@ -321,7 +321,8 @@ class Linear:
             total += float(np.sum(block.information * np.square(self.at.tables[self.numbering.local] - block.start)))
         return total
 
-    def _gauge(self) -> Array | None:
+    def gauge(self) -> Array | None:
+        """Return the changes of the border that no reading sees, (q, g); None without."""
         if not self.problem.gauge:
             return None
         q = self.numbering.size
