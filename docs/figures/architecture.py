@@ -18,6 +18,7 @@ LAYERS = [
     [("report", "elements of chapters")],
     [("tolerances", "limits and decisions")],
     [("twin", "virtual machines, artefacts, sensors")],
+    [("measurement", "a method as a model, stated once")],
     [("datasets", "schemas, units, provenance, files")],
     [("plugins", "contracts and registry")],
     [("kinematics", "poses, twists, chains, fits")],
@@ -27,7 +28,7 @@ COLOURS = ("#dbe9f6", "#e8eef4")
 
 
 def main() -> None:
-    figure, axes = plt.subplots(figsize=(7.6, 10.7), dpi=130)
+    figure, axes = plt.subplots(figsize=(7.6, 11.3), dpi=130)
     height, gap = 0.78, 0.22
     for level, row in enumerate(reversed(LAYERS)):
         width = 8.0 / len(row)

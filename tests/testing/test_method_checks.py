@@ -100,6 +100,9 @@ class Sound:
         errors = self.identify(raw, settings)
         return errors.assign({name: (errors[name] * 0).assign_attrs(errors[name].attrs) for name in datasets.DOF})
 
+    def expected(self, settings):
+        return make(0)[0]
+
 
 def design(origin, beam, point):
     """Return the derivatives of the readings by the freedoms, scaled to lengths: (channel, 6)."""
@@ -264,8 +267,9 @@ class PlansOneFreedom(Sound):
         planned = super().plan(settings)
         values = np.stack([planned[name].values for name in datasets.DOF], axis=-1)
         values[:, 1:] = np.nan
-        unit = np.broadcast_to(np.eye(6) * 1e-14, (12, 6, 6))
-        return self.result(planned["time"].values, values, unit, np.zeros((8, 12, 6)), np.zeros(3), CHANNELS, settings)
+        spread, source = planned["covariance"].values, planned["influence"].values
+        point = planned.attrs["functional_point"]
+        return self.result(planned["time"].values, values, spread, source, point, CHANNELS, settings)
 
 
 class Redrawn(Sound):
@@ -325,6 +329,17 @@ class ForgetsItsCalibration(Redrawn):
     groups = ()
 
 
+class PlansOtherSources(Sound):
+    def plan(self, settings):
+        planned = super().plan(settings)
+        return planned.assign_coords(source_group=("source", ["sensors"] * planned.sizes["source"]))
+
+
+class PlansHalfOfTheNoise(Sound):
+    def plan(self, settings):
+        return super().plan(Settings(noise=NOISE / 2))
+
+
 BROKEN = [
     ("info_complete", CannotSayWhatItCannotSee),
     ("info_complete", NeedsAnUnknownKind),
@@ -351,6 +366,8 @@ BROKEN = [
     ("leaves_inputs_alone", LeavesItsMark),
     ("round_trip", ReadsMemoryOnly),
     ("plan", PlansOneFreedom),
+    ("plan_agrees", PlansOtherSources),
+    ("plan_agrees", PlansHalfOfTheNoise),
 ]
 STATISTICAL = ("recovers_truth", "coverage", "figures", "differences", "sources_as_stated")
 

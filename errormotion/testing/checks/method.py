@@ -356,6 +356,37 @@ def plan(subject: MethodSubject) -> str:
     return f"{planned_for}"
 
 
+def why_nothing_expected(subject: MethodSubject) -> str:
+    """Return why a plan cannot be compared with the identification of what it expects; empty if it can."""
+    return "" if hasattr(subject.plugin, "expected") else "the method has no expected raw data (expected)"
+
+
+@METHOD_CHECKS.add(why_not=why_nothing_expected)
+def plan_agrees(subject: MethodSubject) -> str:
+    """The plan and the identification of the raw data that it expects have the same sources and the same covariance."""
+    method, settings = subject.plugin(), subject.effective_settings()
+    planned, found = method.plan(settings), method.identify(method.expected(settings), settings)
+    groups = [_groups(each) for each in (planned, found)]
+    require(
+        groups[0] == groups[1],
+        f"groups of sources: planned {', '.join(groups[0]) or 'none'}; identified {', '.join(groups[1]) or 'none'}",
+    )
+    of_plan, of_result = covariance(planned), covariance(found)
+    require(of_plan.shape == of_result.shape, "the plan and the result have different places")
+    largest = np.sqrt(np.nanmax(np.abs(of_result), initial=0.0, axis=(-2, -1), keepdims=True))
+    same = np.isclose(
+        of_plan, of_result, rtol=SAME, atol=SAME * float(np.max(largest, initial=0.0)) ** 2, equal_nan=True
+    )
+    same |= ~np.isfinite(of_plan) | ~np.isfinite(of_result)  # the freedoms are compared by the check "plan"
+    require(bool(same.all()), f"the covariances differ at {int((~same).any(axis=(-2, -1)).sum())} places")
+    return f"{len(groups[0])} groups: {', '.join(groups[0])}" if groups[0] else "no common sources"
+
+
+def _groups(errors: xr.Dataset) -> list[str]:
+    """Return the groups of the sources of a result."""
+    return sorted({str(group) for group in errors["source_group"].values}) if "source_group" in errors else []
+
+
 def measured_variables(subject: MethodSubject, raw: xr.Dataset) -> tuple[str, ...]:
     """Return the names of the readings: as the subject states, else all arrays of float64 without vectors."""
     if subject.measured:
