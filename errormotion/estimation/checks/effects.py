@@ -79,7 +79,7 @@ class Numbers:
         N = np.einsum("nij,nik,nkj->nj", self.W, rest, self.W)
         alone = np.einsum("nij,nij->nj", self.W, self.W)
         self.redundancy = np.where(used, N / np.where(used, alone, 1.0), 0.0)
-        self.tested = self.redundancy > MIN_REDUNDANCY
+        self.tested = np.asarray(self.redundancy > MIN_REDUNDANCY)
         self.gain = np.where(self.tested, u**2 / np.where(self.tested, N, 1.0), 0.0)
 
     def columns(self, where: Sequence[At]) -> Array:
