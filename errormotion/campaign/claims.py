@@ -11,6 +11,7 @@ folder. Claims prevent mistakes; they do not protect against a user of the compu
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import logging
@@ -21,6 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
@@ -28,7 +30,7 @@ from uuid import uuid4
 from errormotion.campaign.addresses import EXEMPT, is_line, same_device, scheme_of, urls
 from errormotion.campaign.files import BenchCompensator, BenchInstrument, BenchPlan
 from errormotion.errors import RunError
-from errormotion.state import own_folder, state_folder
+from errormotion.state import open_itself, own_folder, state_folder
 
 try:
     import fcntl
@@ -41,6 +43,8 @@ goes beside a measurement, which shows its effect; ``show``, a simulated device,
 
 FOLDERS = ("/run/lock/errormotion", "/tmp/errormotion-lock")
 """Folders of the computer; the first that every user may use is used."""
+LOCK = "lock"
+"""File in such a folder by which claims are serialized."""
 SHARED = 0o1777
 """Mode of such a folder: everybody writes, and removes only what is his own."""
 RELEASE_TIMEOUT = 15.0
@@ -193,7 +197,7 @@ def _new_file(folder: Path, ending: str, wanted: tuple[Use, ...], what: str, not
             _remove_ended(folder)
             _refuse_conflict(folder, wanted)
             try:
-                descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o644)
+                descriptor = open_itself(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
                 os.fchmod(descriptor, 0o644)  # every user reads it, whatever the mask
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
             except OSError as error:
@@ -211,15 +215,9 @@ def _new_file(folder: Path, ending: str, wanted: tuple[Use, ...], what: str, not
 @contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[None]:
     """Serialize claims, so that of two programs that start at the same time one is refused."""
-    path = folder / "lock"
-    flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+    path = folder / LOCK
     try:
-        try:
-            descriptor = os.open(path, flags)
-        except FileNotFoundError:
-            descriptor = os.open(path, flags | os.O_CREAT, 0o644)
-            with suppress(OSError):
-                os.fchmod(descriptor, 0o644)
+        descriptor = _lock_file(folder)
     except OSError as error:
         raise RunError(f"{path}: the instruments cannot be claimed: {error.strerror}") from error
     try:
@@ -231,6 +229,17 @@ def _one_at_a_time(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _lock_file(folder: Path) -> int:
+    """Open the file by which claims are serialized; create it if it is missing."""
+    try:
+        return open_itself(folder / LOCK, os.O_RDONLY)
+    except FileNotFoundError:
+        descriptor = open_itself(folder / LOCK, os.O_RDONLY | os.O_CREAT, 0o644)
+        with suppress(OSError):
+            os.fchmod(descriptor, 0o644)
+        return descriptor
 
 
 def _try_lock(descriptor: int) -> bool:
@@ -289,7 +298,7 @@ def _files(folder: Path, endings: str | tuple[str, ...]) -> Iterator[tuple[Path,
         return
     for name in names[:MAX_CLAIMS]:
         try:
-            descriptor = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            descriptor = open_itself(folder / name, os.O_RDONLY)
         except OSError:  # ended, or not a file of this program
             continue
         try:
@@ -335,7 +344,7 @@ def _folder() -> tuple[Path | None, str]:
     if fcntl is None:
         return None, "This system has no file locks: whether another program uses the instruments is not known."
     for place in FOLDERS:
-        if _is_shared(place):
+        if _is_shared(place) and _can_lock(place):
             other = f"{FOLDERS[0]} cannot be used; the claims of the instruments are in {place}."
             return Path(place), "" if place == FOLDERS[0] else other
     own = state_folder() / "claims"
@@ -344,10 +353,39 @@ def _folder() -> tuple[Path | None, str]:
     except OSError as error:
         none = f"No folder for claims of the instruments can be used ({', '.join(FOLDERS)}, {own}: {error.strerror})."
         return None, f"{none} Whether another program uses the instruments is not known."
+    if not _can_lock(str(own)):
+        return None, (
+            f"No file can be locked in {', '.join(FOLDERS)} or {own}. Whether another program uses the instruments is "
+            "not known; start no second one on this machine."
+        )
     return own, (
         f"None of {', '.join(FOLDERS)} can be used by every user of this computer; the claims of the instruments are "
         f"in {own}. Programs of other users do not see them."
     )
+
+
+def _can_lock(place: str) -> bool:
+    """Return whether files of a folder can be locked; some file systems refuse it."""
+    try:
+        found = os.stat(place)
+    except OSError:
+        return False
+    return _locks(place, found.st_dev, found.st_ino)
+
+
+@cache
+def _locks(place: str, device: int, number: int) -> bool:  # noqa: ARG001 - of the folder, which may be replaced
+    try:
+        descriptor = _lock_file(Path(place))
+    except OSError as error:  # a folder with a lock that is not one: claims there are refused, and nothing is hidden
+        return error.errno in (errno.ELOOP, errno.EINVAL)
+    try:
+        _free(descriptor)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True
 
 
 def _is_shared(place: str) -> bool:

@@ -18,7 +18,7 @@ import typer
 
 from errormotion.cli import output
 from errormotion.errors import ErrormotionError
-from errormotion.state import NO_FOLLOW, close_to_others, own_folder, state_folder
+from errormotion.state import close_to_others, open_itself, own_folder, state_folder
 
 OK, ERROR, USAGE, INVALID, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 70, 130
 NONCONFORMING, UNDECIDED = 4, 5
@@ -80,8 +80,8 @@ class _LogHandler(RotatingFileHandler):
 
     def _open(self) -> Any:
         """Open the log for its user only; a link is not followed."""
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | NO_FOLLOW
-        return os.fdopen(os.open(self.baseFilename, flags, 0o600), "a", encoding=self.encoding)
+        descriptor = open_itself(self.baseFilename, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        return os.fdopen(descriptor, "a", encoding=self.encoding)
 
     def handleError(self, record: logging.LogRecord) -> None:
         pass

@@ -19,7 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from errormotion.campaign.planning.release import WORD, require_word
+from errormotion.campaign.planning.release import WORD, refuse, require_word
 from errormotion.cli.curves import Curves
 from errormotion.cli.terminal import Terminal
 
@@ -120,7 +120,7 @@ class Bars:
         """Show a request to the operator and wait for Enter."""
         self._progress.stop()
         try:
-            self._console.input(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ", markup=False)
+            self._console.answer(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ")
         finally:
             self._progress.start()
 
@@ -130,21 +130,17 @@ class Bars:
         Raises
         ------
         RunError
-            Another text was typed. Nothing has moved.
+            Another text was typed, or the input is not a terminal. Nothing has moved.
         """
+        if not on_terminal():
+            refuse(motions)
         self._progress.stop()
         try:
             if not self._announcing:
                 for line in motions:
                     self._console.print(line, markup=False, soft_wrap=True)
-            try:
-                typed = self._console.input(
-                    f"\nThe machine is not simulated. Type '{WORD}' to release these motions, anything else to end: ",
-                    markup=False,
-                )
-            except EOFError:
-                typed = ""
-            require_word(typed)
+            question = "The machine is not simulated. Type '{}' to release these motions, anything else to end: "
+            require_word(self._console.answer("\n" + question.format(WORD)))
         finally:
             self._progress.start()
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
+from errormotion.report.exports.tables import plain_text
 
 MAX_POINTS = 2000
 """Number of points of a reduced curve: about two for each pixel of a wide screen."""
@@ -141,17 +142,13 @@ def as_csv(found: CurveSet) -> str:
     out = io.StringIO()
     table = csv.writer(out)
     heads = [f"{each.name} / {each.unit}" for each in found.curves]
-    table.writerow([found.label, *(text for head in heads for text in (head, f"U (k=2) of {head}"))])
+    columns_of = (text for head in heads for text in (head, f"U (k=2) of {head}"))
+    table.writerow([plain_text(text) for text in (found.label, *columns_of)])
     columns = [column for each in found.curves for column in (each.values, each.expanded)]
     for k, place in enumerate(found.places):
-        first = _cell(found.names[k]) if found.names else f"{place:.9g}"
+        first = plain_text(found.names[k]) if found.names else f"{place:.9g}"
         table.writerow([first, *(f"{column[k]:.6g}" if np.isfinite(column[k]) else "" for column in columns)])
     return out.getvalue()
-
-
-def _cell(text: str) -> str:
-    """Return a text that a spreadsheet does not interpret as a formula."""
-    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
 def _abscissa(ds: xr.Dataset, dim: str) -> tuple[str, Array, tuple[str, ...]]:

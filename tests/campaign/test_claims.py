@@ -1,5 +1,6 @@
 """One device serves one program: a second one is refused and told who uses it; a display closes its instruments."""
 
+import errno
 import os
 import platform
 import signal
@@ -418,3 +419,37 @@ def test_the_hash_of_an_address_does_not_disclose_it() -> None:
     (found,) = uses(thermometer("tcp://secret.example:502"))
     assert isinstance(found, Use)
     assert "secret" not in found.key
+
+
+@pytest.mark.parametrize("places", [1, 2])
+def test_a_folder_whose_files_cannot_be_locked_is_replaced_with_a_note(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: int
+) -> None:
+    """Some network file systems refuse locks."""
+    refused = [tmp_path / "first", tmp_path / "second"][:places]
+    real = claims.fcntl.flock
+
+    def flock(descriptor: int, how: int) -> None:
+        if Path(os.readlink(f"/proc/self/fd/{descriptor}")).parent in refused:
+            raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        real(descriptor, how)
+
+    monkeypatch.setattr(claims.fcntl, "flock", flock)
+    claims._locks.cache_clear()
+    with claimed(MILL, "a run") as held:
+        assert "cannot be used" in held.note or "can be used by every user" in held.note
+        found = holder(MILL)
+        assert found is not None
+        assert found.what == "a run"
+        with pytest.raises(RunError, match="in use by another program"), claimed(MILL, "a second run"):
+            pass
+    refused.append(claims.state_folder() / "claims")
+    refused += [tmp_path / "first", tmp_path / "second"]
+    claims._locks.cache_clear()
+    with claimed(MILL, "a run") as held, claimed(MILL, "a second run"):
+        assert "No file can be locked" in held.note
+        assert "start no second one" in held.note
+    assert holder(MILL) is None
+    with watching(MILL) as free:
+        assert free
+    claims._locks.cache_clear()

@@ -103,6 +103,39 @@ def test_the_word_on_a_terminal_releases_the_motions(campaign: Path, on_terminal
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("typed", ["move\n", "\n\nmove\nmove\nmove\n", "move"])
+def test_what_was_typed_before_the_question_releases_nothing(
+    campaign: Path, on_terminal: Callable[..., Terminal], typed: str
+) -> None:
+    run = on_terminal("run", "campaign.toml", "--no-report")
+    run.type(typed)  # while the command starts
+    run.wait_for(WORD)
+    time.sleep(2.0)
+    assert run.process.poll() is None, run.shown
+    assert not (campaign.parent / "runs").exists()
+    run.type("\n")
+    assert run.end() == 1, run.shown
+    assert "Nothing has moved" in run.shown
+    assert not (campaign.parent / "runs").exists()
+
+
+@pytest.mark.slow
+def test_the_word_of_a_pipe_releases_nothing(campaign: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-m", "errormotion", "run", "campaign.toml"],
+        cwd=campaign.parent,
+        env=os.environ | {"XDG_STATE_HOME": str(campaign.parent / "state")},
+        input="move\n" * 10,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert found.returncode == 1, found.stderr
+    assert "Nothing has moved" in found.stderr
+    assert not (campaign.parent / "runs").exists()
+
+
+@pytest.mark.slow
 def test_a_background_process_is_released_where_it_is_started(
     campaign: Path, on_terminal: Callable[..., Terminal]
 ) -> None:

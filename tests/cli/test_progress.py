@@ -1,15 +1,21 @@
 """Progress bars with the remaining time on a terminal, no output elsewhere."""
 
 import io
+import os
+import pty
 import re
+import select
+import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from errormotion.cli.curves import MAX_CURVES, MAX_POINTS, Curves
 from errormotion.cli.progress import Bars
+from errormotion.errors import RunError
 
 
 class Terminal(io.StringIO):
@@ -100,3 +106,87 @@ def test_a_long_curve_keeps_its_shape_in_bounded_memory() -> None:
     plain = Curves()
     plain.add("12 of 300 values undecided, v1.2.3")
     assert not plain.shown
+
+
+ASKING = """
+import time
+from errormotion.cli.progress import Bars
+from errormotion.errors import RunError
+from errormotion.errors import RunError
+print("ready", flush=True)
+time.sleep(1.0)
+with Bars(quiet=True) as bars:
+    {work}
+print("done", flush=True)
+"""
+
+
+@pytest.fixture
+def at_terminal() -> Iterator[Callable[[str], tuple[subprocess.Popen[bytes], int]]]:
+    """Return a function that runs statements with bars on a terminal."""
+    started = []
+
+    def start(work: str) -> tuple[subprocess.Popen[bytes], int]:
+        own, theirs = pty.openpty()
+        words = [sys.executable, "-c", ASKING.format(work=work)]
+        process = subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, env=os.environ | {"TERM": "dumb"})
+        os.close(theirs)
+        started.append((process, own))
+        return process, own
+
+    yield start
+    for process, own in started:
+        process.kill()
+        process.wait()
+        os.close(own)
+
+
+def shown(own: int, text: str, seconds: float) -> str:
+    """Return what a terminal shows until a text, or for a time."""
+    found, end = "", time.monotonic() + seconds
+    while text not in found and time.monotonic() < end:
+        if select.select([own], [], [], 0.1)[0]:
+            try:
+                found += os.read(own, 65536).decode()
+            except OSError:
+                break
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("work", ['bars.ask("Mount the bar.")', 'bars.release(["X moves"])'])
+@pytest.mark.parametrize("typed", [b"move\n", b"move\nmove\n\n\n", b"mo", b"\x04\x04"])
+def test_only_what_is_typed_after_a_question_answers_it(
+    at_terminal: Callable[[str], tuple[subprocess.Popen[bytes], int]], work: str, typed: bytes
+) -> None:
+    process, own = at_terminal(work)
+    assert "ready" in shown(own, "ready", 60.0)
+    os.write(own, typed)  # before the question
+    assert ": " in shown(own, ": ", 60.0)
+    time.sleep(1.0)
+    assert process.poll() is None
+    os.write(own, b"move\n")
+    assert "done" in shown(own, "done", 60.0)
+
+
+@pytest.mark.slow
+def test_a_paste_that_arrives_during_the_question_releases_nothing(
+    at_terminal: Callable[[str], tuple[subprocess.Popen[bytes], int]],
+) -> None:
+    process, own = at_terminal('bars.release(["X moves"])')
+    assert "ready" in shown(own, "ready", 60.0)
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:  # over a slow connection
+        os.write(own, b"move\n")
+        time.sleep(0.05)
+    time.sleep(1.0)
+    assert process.poll() is None
+    os.write(own, b"no\n")
+    assert "expected the word" in " ".join(shown(own, "releases the motions; found", 60.0).split())
+
+
+def test_without_a_terminal_no_word_releases(monkeypatch: pytest.MonkeyPatch, terminal: Callable[[], Terminal]) -> None:
+    terminal()
+    monkeypatch.setattr(sys, "stdin", io.StringIO("move\n"))
+    with pytest.raises(RunError, match="not released"), Bars() as bars:
+        bars.release(["X moves"])

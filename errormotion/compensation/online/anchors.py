@@ -17,8 +17,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.writing import create_bytes, replace_bytes
 from errormotion.errors import CompensationError
-from errormotion.state import NO_FOLLOW, is_private, own_folder, state_folder
+from errormotion.state import is_private, open_itself, own_folder, state_folder
 
 KEY, FOLDER = "audit.key", "audit"
 KEY_BYTES = 32
@@ -48,11 +49,8 @@ def own_key() -> bytes:
     try:
         path = own_folder() / KEY
         if not os.path.lexists(path):
-            part = path.with_name(f".{KEY}.{secrets.token_hex(8)}")
-            _write(part, secrets.token_hex(KEY_BYTES).encode(), sync=True)
             with suppress(FileExistsError):  # another process has created it
-                os.link(part, path)
-            part.unlink()
+                create_bytes(path, secrets.token_hex(KEY_BYTES).encode(), mode=0o600)
         return _read_key(path)
     except (OSError, ValueError) as error:
         raise CompensationError(
@@ -76,13 +74,7 @@ def name_of(key: bytes) -> str:
 def save(anchor: Anchor) -> None:
     """Store what is known of a log. A power failure may undo this, which proves less, and refuses nothing."""
     path = own_folder(FOLDER) / _name(anchor.path)
-    part = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
-    try:
-        _write(part, json.dumps(asdict(anchor)).encode(), sync=False)
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
+    replace_bytes(path, json.dumps(asdict(anchor)).encode(), flush=False, mode=0o600)
 
 
 def of_path(path: Path) -> Anchor | None:
@@ -116,21 +108,12 @@ def _read(path: Path) -> Anchor | None:
 
 
 def _read_key(path: Path) -> bytes:
-    handle = os.open(path, os.O_RDONLY | NO_FOLLOW | getattr(os, "O_NONBLOCK", 0))  # a pipe would wait for its writer
+    handle = open_itself(path, os.O_RDONLY)
     with os.fdopen(handle, "rb") as file:
         found = os.fstat(handle)
-        if not stat.S_ISREG(found.st_mode) or not is_private(found):
+        if not is_private(found):
             raise ValueError(f"found mode {stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}")
         key = bytes.fromhex(file.read(4 * KEY_BYTES).decode("ascii"))
     if len(key) != KEY_BYTES:
         raise ValueError(f"found {len(key)} bytes instead of {KEY_BYTES}")
     return key
-
-
-def _write(path: Path, content: bytes, *, sync: bool) -> None:
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NO_FOLLOW, 0o600)
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-        file.flush()
-        if sync:
-            os.fsync(handle)

@@ -30,7 +30,7 @@ from errormotion.compensation.online.anchors import Anchor
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import sync
 from errormotion.errors import CompensationError
-from errormotion.state import NO_FOLLOW
+from errormotion.state import open_itself
 
 START = "0" * 64
 """Hash before the first line."""
@@ -117,7 +117,7 @@ class AuditLog:
         self._log = self._reader.log or secrets.token_hex(16)
         self._count, self._hash = self._reader.count, self._reader.hash
         self._synced, self._saved = time.monotonic(), -1
-        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | NO_FOLLOW, 0o600)
+        self._file = open_itself(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         try:
             sync(path.parent)  # the name of a new file
             self._sync()

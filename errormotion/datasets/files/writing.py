@@ -13,12 +13,12 @@ import os
 import re
 import secrets
 import shutil
-import stat
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from errormotion.errors import DatasetError
+from errormotion.state import open_itself
 
 _REASONS = {
     errno.ENOENT: "there is no such folder",
@@ -112,7 +112,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         remove(part)
 
 
-def replace_all(contents: Mapping[Path, bytes | memoryview], *, flush: bool = True) -> None:
+def replace_all(contents: Mapping[Path, bytes | memoryview], *, flush: bool = True, mode: int = 0o666) -> None:
     """Write or replace files; each changes in one step, and on return all are on the disk.
 
     The files are flushed before the first of them gets its name. Without ``flush`` they may be empty or old after a
@@ -128,7 +128,7 @@ def replace_all(contents: Mapping[Path, bytes | memoryview], *, flush: bool = Tr
         parts = {}
         for path, content in contents.items():
             with _named(path):
-                part = parts[path] = stack.enter_context(_part(path))
+                part = parts[path] = stack.enter_context(_part(path, mode))
                 with part.open("r+b") as file:
                     file.write(content)
                     if flush:
@@ -143,9 +143,28 @@ def replace_all(contents: Mapping[Path, bytes | memoryview], *, flush: bool = Tr
                 sync(folder)
 
 
-def replace_bytes(path: Path, content: bytes | memoryview, *, flush: bool = True) -> None:
+def replace_bytes(path: Path, content: bytes | memoryview, *, flush: bool = True, mode: int = 0o666) -> None:
     """Write or replace a file, as `replace_all`."""
-    replace_all({path: content}, flush=flush)
+    replace_all({path: content}, flush=flush, mode=mode)
+
+
+def create_bytes(path: Path, content: bytes, *, mode: int = 0o666) -> None:
+    """Write a file that does not exist yet, in one step; on return it is on the disk.
+
+    Raises
+    ------
+    FileExistsError
+        There is a file of this name, of another process for example; it is not changed.
+    OSError
+        The file cannot be written.
+    """
+    with _part(path, mode) as part:
+        with part.open("r+b") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.link(part, path)
+        sync(path.parent)
 
 
 def replace_text(path: Path, text: str, *, flush: bool = True) -> None:
@@ -162,18 +181,7 @@ def open_to_append(path: Path, mode: int = 0o666) -> int:
         The file cannot be written, or is a link, a pipe or a device: a folder of unknown origin may contain such under
         the name of a log.
     """
-    options = os.O_RDWR | os.O_APPEND | os.O_CREAT | getattr(os, "O_CLOEXEC", 0)
-    options |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)  # opening a pipe would wait for its reader
-    try:
-        descriptor = os.open(path, options, mode)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise OSError(error.errno, "is a link, and links are not written through", str(path)) from None
-        raise
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(errno.EINVAL, "is not a regular file", str(path))
-    return descriptor
+    return open_itself(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, mode)
 
 
 def make_folder(path: Path) -> None:
@@ -212,11 +220,10 @@ def is_part(name: str) -> bool:
 
 
 @contextmanager
-def _part(path: Path) -> Iterator[Path]:
+def _part(path: Path, mode: int = 0o666) -> Iterator[Path]:
     """Create an empty temporary file; remove it after the context unless it was renamed."""
     part = _part_name(path)
-    options = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
-    os.close(os.open(part, options, 0o666))
+    os.close(open_itself(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
     try:
         yield part
     finally:

@@ -16,7 +16,8 @@ from errormotion.report.document import Cell, Table
 
 Entry = float | str | None
 _NUMBER = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:e[+-]?\d+)?")
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = re.compile(r"(^\s*|[,;\t\r\n])([=+\-@\uff1d\uff0b\uff0d\uff20])")
+"""Begin of a formula: at the start of a text, or after what a spreadsheet in another language takes as a separator."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +94,11 @@ def write_csv(sheets: Sequence[Sheet], folder: Path, *, comma: bool = False) -> 
         for each in sheets:
             text = io.StringIO()
             writer = csv.writer(text, delimiter=";" if comma else ",", lineterminator="\r\n")
-            writer.writerow([_safe(name) for name in each.head])
+            writer.writerow([plain_text(name) for name in each.head])
             for row, decimals in zip(each.rows, each.decimals, strict=True):
                 writer.writerow([_written(entry, places, comma) for entry, places in zip(row, decimals, strict=True)])
             for note in (each.caption, *each.notes):
-                writer.writerow([_safe(f"# {note}")])
+                writer.writerow([plain_text(f"# {note}")])
             name = f"{each.number:02d}-{re.sub(r'[^a-z0-9]+', '-', each.section.lower()).strip('-')[:40]}.csv"
             (beside / name).write_bytes(text.getvalue().encode("utf-8-sig"))
     return folder
@@ -107,9 +108,14 @@ def _written(entry: Entry, places: int | None, comma: bool) -> str:
     if isinstance(entry, float):
         text = f"{entry:.{places or 0}f}" if abs(entry) >= 1e-6 or not entry else f"{entry:.9g}"
         return text.replace(".", ",") if comma else text
-    return _safe(entry or "")
+    return plain_text(entry or "")
 
 
-def _safe(text: str) -> str:
-    """Return a text that no spreadsheet interprets as a formula."""
-    return f"'{text}" if text.startswith(_FORMULA) else text
+def plain_text(text: str) -> str:
+    """Return a text that no spreadsheet interprets as a formula: an apostrophe stands before each start of one.
+
+    A file with commas is also opened with semicolons, and the other way round. A tab or a line at the start, which some
+    programs discard, does not hide what follows.
+    """
+    found = _FORMULA.sub(r"\1'\2", text)
+    return f"'{found}" if found.startswith(("\t", "\r", "\n")) else found

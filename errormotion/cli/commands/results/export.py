@@ -22,7 +22,7 @@ from errormotion.datasets.results.tables import to_dataframe
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 from errormotion.report.exports import xlsx
-from errormotion.report.exports.tables import Entry, Sheet
+from errormotion.report.exports.tables import Entry, Sheet, plain_text
 
 MAX_ROWS = 2**20 - 2
 """Largest number of rows of a table in a workbook: the limit of the format, less caption and head."""
@@ -132,5 +132,5 @@ def _csv(sheet: Sheet) -> bytes:
 def _text(entry: Entry) -> str:
     """Return a cell; a text that a spreadsheet would take as a formula is preceded by an apostrophe."""
     if isinstance(entry, str):
-        return f"'{entry}" if entry[:1] in ("=", "+", "-", "@", "\t", "\r") else entry
+        return plain_text(entry)
     return "" if entry is None else f"{entry:.12g}"

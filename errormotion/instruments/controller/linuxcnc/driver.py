@@ -24,6 +24,7 @@ from errormotion.instruments.transports import Transport, open_transport
 from errormotion.instruments.transports.quiet import after_others
 from errormotion.instruments.transports.recording import Recorder, RecordingTransport
 from errormotion.plugins import Identity, InstrumentInfo, MachineLimits, lazy
+from errormotion.state import open_itself
 
 ESTOP_TIMEOUT = 2.0  # s
 ESTOP_INTERVAL = 0.01  # s between two queries of the state
@@ -401,7 +402,7 @@ def read_token(path: Path, address: str) -> str:
     """
     path = path.expanduser()
     try:
-        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        handle = open_itself(path, os.O_RDONLY)
         with os.fdopen(handle, encoding="ascii", errors="replace") as file:
             found = os.fstat(handle)
             owned = os.geteuid() in (0, found.st_uid)
