@@ -123,9 +123,10 @@ def verdict(ds: xr.Dataset) -> list[str]:
                 lines.append(f"{pair}: none of the known causes explains the difference better than chance.")
         elif first.p < 1e-3:
             lines.append(f"{pair}: no single cause explains the difference; the nearest is {first.sized}.")
+        elif first.alike:
+            lines.append(f"{pair}: possible causes, which these data cannot distinguish: {first.sized}; {first.alike}.")
         else:
-            more = f" Indistinguishable from: {first.alike}." if first.alike else ""
-            lines.append(f"{pair}: most likely cause: {first.sized}.{more}")
+            lines.append(f"{pair}: most likely cause: {first.sized}.")
     if shared := _shared(ds):
         more = f" and {len(shared) - MAX_SHARED} more" if len(shared) > MAX_SHARED else ""
         lines.append(f"Treated as fully correlated between datasets: {'; '.join(shared[:MAX_SHARED])}{more}.")

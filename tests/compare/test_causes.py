@@ -198,3 +198,16 @@ def test_one_matrix_for_all_points_is_the_same_as_one_at_each_point(unknown):
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15 * np.nanmax(np.abs(expected), initial=0))
         moved = Stored(each, np.array([0.1, 0.0, -0.2]))
         np.testing.assert_array_equal(moved.values(A), moved.changed(A).value)
+
+
+def test_causes_that_the_data_cannot_distinguish_have_no_rank_in_the_sentence():
+    found = compare({"a": made("a", rng := np.random.default_rng(1)), "b": made("b", rng, change=factor(("EA",), 1.3))})
+    found = stated(found, cause="scale of EA", alike="drift; sign of EB")
+    found["cause_p"].values[0, 0] = 0.5
+    told = [line for line in verdict(found) if line.startswith("a - b: possible causes")]
+    assert len(told) == 1
+    assert told[0].startswith("a - b: possible causes, which these data cannot distinguish: scale of EA")
+    assert told[0].endswith("; drift; sign of EB.")
+    assert "most likely" not in " ".join(verdict(found))
+    found = stated(found, alike="")
+    assert any(line.startswith("a - b: most likely cause: scale of EA") for line in verdict(found))
