@@ -8,12 +8,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 """Array of float64; its shape and unit are stated in the docstrings of functions."""
 
-NORMAL_MAD = 1.4826
-"""Standard deviation of normally distributed values over the median of their absolute deviations: 1 / ndtri(0.75).
-
-`scipy.stats.median_abs_deviation` cannot be compiled, and its import takes 0.3 s.
-"""
-
 
 def filled(values: Array) -> Array:
     """Return a copy with 0 for NaN."""

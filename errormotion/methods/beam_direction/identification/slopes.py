@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_median
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -204,8 +205,7 @@ def _least_deviations(design: Array, distance: Array) -> Array:
 
 def _outliers(residual: Array, used: Mask, total: float) -> Mask:
     """Return the outliers with respect to the stated noise and to the observed scatter."""
-    scatter = NORMAL_MAD * np.median(np.abs(residual[used] - np.median(residual[used])))
-    return np.asarray(np.abs(residual) > OUTLIER * max(float(scatter), total))
+    return np.asarray(np.abs(residual) > OUTLIER * max(scale_about_median(residual[used]), total))
 
 
 def _check_strokes(design: Array, total: float, name: str) -> None:

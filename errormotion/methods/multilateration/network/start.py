@@ -16,8 +16,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 
 MAX_READINGS = 150
 """Maximum number of readings of a station used for its start value."""
@@ -163,7 +164,7 @@ def _from_subsets(d: Array, u: Array) -> list[Array]:
     for _ in range(_DRAWS):
         some = rng.permutation(len(d))[:_DRAWN]
         x = _linear(d[some], u[some])
-        tried.append((_scale(d - np.linalg.norm(u - x[:3], axis=1) + x[3]), x))
+        tried.append((scale_about_zero(d - np.linalg.norm(u - x[:3], axis=1) + x[3]), x))
     return [x for _, x in sorted(tried, key=lambda each: each[0])[:3]]
 
 
@@ -188,7 +189,7 @@ def _residuals(x: Array, d: Array, u: Array) -> tuple[Array, Array, float]:
     v = u - x[:3]
     distance = np.sqrt(np.einsum("ia,ia->i", v, v))
     r = d - distance + x[3]
-    return r, v / distance[:, None], _scale(r)
+    return r, v / distance[:, None], scale_about_zero(r)
 
 
 def _refined(x: Array, d: Array, u: Array) -> tuple[Array, float]:
@@ -242,11 +243,6 @@ def _of_good_readings(reading: bytes, target: bytes) -> tuple[Array, float]:
     x = _linear(d, u)
     # Negative distances: the sign may be reversed.
     return _refined(x, d, u) if x[3] + np.median(d) >= 0.0 else (x, np.inf)
-
-
-def _scale(r: Array) -> float:
-    """Return the robust scale of residuals about zero."""
-    return NORMAL_MAD * float(np.median(np.abs(r)))
 
 
 def _misfit_message(j: int, d: Array, u: Array, extent: float, scale: float) -> str:

@@ -19,12 +19,13 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.datasets import provenance
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.pretravel import HIGHEST, PretravelMap, assemble, harmonics, terms_up_to, unit
 from errormotion.datasets.units import Length
 from errormotion.errors import FitError
+from errormotion.estimation.robust import NORMAL_MAD
 from errormotion.plugins import PluginSettings, Touch
 
 REDUNDANCY = 4

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_median
 from errormotion.kinematics.beams import across, turned
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def likelihood_fit(
     while True:
         origin, direction, jacobian = _gauss_newton(distance, centre, radius, origin, direction, used, name)
         residual = distance - sphere_reading(origin, direction, centre, radius)[0]
-        spread = NORMAL_MAD * np.median(np.abs(residual[used] - np.median(residual[used])))
+        spread = scale_about_median(residual[used])
         outlier = used & ~(np.abs(residual) <= max(_OUTLIER * spread, 1e-12))
         if not outlier.any():
             break

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.datasets import provenance, validate
 from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.inclination import (
@@ -29,6 +29,7 @@ from errormotion.datasets.calibrations.inclination import (
 )
 from errormotion.datasets.units import Angle
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction.identification.inclination import lines as inclination_lines
 from errormotion.methods.beam_direction.identification.inclination import surface as inclination_surface
@@ -170,7 +171,7 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
             mirror=settings.mirror,
         )
         z = np.abs(surface.prediction.z)
-        z = z / max(NORMAL_MAD * float(np.median(z)), 1e-3)
+        z = z / max(scale_about_zero(z), 1e-3)
         # only the largest deviations, because they also affect their neighbours
         wrong = z > max(_CONTRADICTION, 0.5 * z.max())
         if not wrong.any() or (~kept).sum() + wrong.sum() > _MAX_CONTRADICTING * len(q):

@@ -12,8 +12,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 
 Indices = NDArray[np.int64]
 
@@ -259,7 +260,7 @@ def _inliers(residual: Array, kept: NDArray[np.bool_], readings: Readings, free:
     count = np.bincount(readings.setting)
     # The residuals of a fitted line are smaller than the errors, by the degrees of freedom of the line.
     share = min(len(count) * (2 if free else 1) / kept.sum(), 0.75)
-    scale = max(NORMAL_MAD * float(np.median(np.abs(residual[kept]))) / np.sqrt(1 - share), _MIN_NOISE)
+    scale = max(scale_about_zero(residual[kept]) / np.sqrt(1 - share), _MIN_NOISE)
     few = count[readings.setting] < (_ENOUGH if free else 2)
     return np.asarray((np.abs(residual) <= _OUTLIER * scale) | few)
 
@@ -334,7 +335,7 @@ def mid_range(readings: Readings, lines: Lines) -> MidRange:
     for _ in range(3):  # without outliers of the zeros
         (_, shift), *_ = np.linalg.lstsq(A[good], lines.offset[good])
         rest = lines.offset - A @ np.array([np.median(lines.offset + lines.slope * shift), shift])
-        good = np.abs(rest) <= _OUTLIER * max(NORMAL_MAD * float(np.median(np.abs(rest))), _MIN_NOISE)
+        good = np.abs(rest) <= _OUTLIER * max(scale_about_zero(rest), _MIN_NOISE)
     scatter = float(np.sqrt((rest[good] ** 2).sum() / max(int(good.sum()) - 2, 1)))
     C = np.linalg.inv(A[good].T @ A[good]) * scatter**2
     return MidRange(readings.mid_range + float(shift), float(np.sqrt(C[1, 1])))

@@ -29,9 +29,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import edges
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.edges import Tilt
 
@@ -325,11 +326,11 @@ class _Fit:
         """Estimate both scatters from the residuals; return the lines within `CLIP`."""
         half_sum, half_difference, cos, sin = self._rim(p, pose(*p[:6]))
         right = np.sqrt(2) * half_difference / cos
-        rough = max(NORMAL_MAD * float(np.median(np.abs(right[used]))), 1e-9)
+        rough = max(scale_about_zero(right[used]), 1e-9)
         fits = (cos > OBLIQUE) & (np.abs(right) < CLIP * rough)
         self.size_x = max(float(np.sqrt(np.mean(right[fits] ** 2))), 1e-9)
         size = np.hypot(cos * self.size_x / np.sqrt(2), sin * self.size_y)
-        rough = max(NORMAL_MAD * float(np.median(np.abs(half_sum[fits] / size[fits]))), 1e-3)
+        rough = max(scale_about_zero(half_sum[fits] / size[fits]), 1e-3)
         fits &= np.abs(half_sum) < CLIP * rough * size
         along = (half_sum**2 - (cos * self.size_x) ** 2 / 2) * sin**2
         self.size_y = float(np.sqrt(max(along[fits].sum() / np.sum(sin[fits] ** 4), 1e-18)))

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 
 Mask = NDArray[np.bool_]
 
@@ -96,7 +97,7 @@ def tilt(x: Array, height: Array) -> Tilt:
         weights = spread[full] / spread[full].sum()
         slope = float(weights @ slopes)
         residual = height - np.where(n > 0, mean_z - slope * mean_x, np.nan)[:, None] - slope * x
-        size = NORMAL_MAD * np.nanmedian(np.abs(residual[used]))
+        size = scale_about_zero(residual[used])
         used &= np.abs(np.where(np.isfinite(residual), residual, np.inf)) <= CLIP * max(size, 1e-12)
     count = slopes.size
     # variance of a weighted mean, from the scatter about it

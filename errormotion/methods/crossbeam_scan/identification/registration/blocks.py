@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import NORMAL_MAD
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Moments
 from errormotion.methods.crossbeam_scan.identification.registration.kernels.planes import COLUMNS, FEWEST, POINTS, ROWS
 from errormotion.methods.crossbeam_scan.identification.registration.reduction import (

@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.kinematics.poses import displaced
 from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.registration import clouds
@@ -147,7 +148,7 @@ def _pairs(old: Array, new: Array, surfaces: list[Normals], pose: RigidTransform
     normal = 0.5 * (n + np.sign(cosine)[:, None] * ahead)
     residual = np.sum(normal * (p - old[q]), axis=1)
     alike = np.abs(cosine) >= ALIKE
-    scale = NORMAL_MAD * float(np.median(np.abs(residual[alike]))) if alike.any() else 0.0
+    scale = scale_about_zero(residual[alike]) if alike.any() else 0.0
     used = alike & (np.abs(residual) <= GATE * scale)
     if used.sum() < MIN_PAIRS:
         raise MethodError(

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
+from errormotion.estimation.robust import NORMAL_MAD
 from errormotion.methods.crossbeam_scan.identification.registration.kernels import planes
 from errormotion.methods.crossbeam_scan.identification.registration.kernels.planes import (
     COLUMNS,

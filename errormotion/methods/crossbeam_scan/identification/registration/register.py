@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import THIN, BlockMap
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Freedoms, freedoms, refuse, scales
@@ -224,7 +225,7 @@ def _relief(block_map: BlockMap) -> float:
     known = block_map.known
     rows = np.column_stack([np.ones(known.sum()), x[known], y[known]])
     rest = block_map.height[known] - rows @ np.linalg.lstsq(rows, block_map.height[known], rcond=None)[0]
-    return float(NORMAL_MAD * np.median(np.abs(rest)))
+    return scale_about_zero(rest)
 
 
 def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool) -> _Found:

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
+from errormotion.estimation.robust import NORMAL_MAD
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap, some_of, upper_median
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import compare, lag_sums
 from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from errormotion.arrays import NORMAL_MAD, Array
+from errormotion.arrays import Array
+from errormotion.estimation.robust import NORMAL_MAD, scale_about_zero
 from errormotion.methods.multilateration.network.loops import COMPILED_FROM, loops
 from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.network.network import Network
@@ -74,7 +75,7 @@ def normalised(network: Network) -> Array:
 
 def gate(t: Array) -> float:
     """Return the normalised residual above which a reading is an outlier, from all (n, m)."""
-    scale = max(1.0, NORMAL_MAD * float(np.nanmedian(np.abs(t))))
+    scale = max(1.0, scale_about_zero(t))
     return scale * _least_gate(int(np.count_nonzero(np.isfinite(t))))
 
 
