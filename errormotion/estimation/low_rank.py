@@ -21,7 +21,7 @@ from scipy import linalg
 from errormotion.arrays import Array, filled
 
 MIN_VARIANCE = 1e-12
-"""Fraction of the largest variance of a freedom below which a direction is treated as one without variance in D."""
+"""Fraction of the largest variance of a freedom below which a direction is treated as one without variance."""
 PLAIN = 1e-8
 """Smallest eigenvalue of a block of D, scaled as above, that is factored without its eigenvectors."""
 
@@ -183,3 +183,22 @@ def _inverse(L: Array) -> Array:
         found[:, i, i] = reciprocal[:, i]
         found[:, i, :i] = -reciprocal[:, i, None] * np.matmul(L[:, i, None, :i], found[:, :i, :i])[:, 0]
     return found
+
+
+def root_of(covariance: Array, *, unit: Array | None = None, smallest: float = MIN_VARIANCE) -> Array:
+    """Return R (n, k) with ``R R' = covariance`` (n, n): columns are independent sources, the largest last.
+
+    Parameters
+    ----------
+    covariance : ndarray, (n, n)
+        Positive semidefinite except for rounding.
+    unit : ndarray, (n,), optional
+        Units in which the rows are compared, such as m and rad; by default their standard uncertainties.
+    smallest : float
+        Fraction of the largest variance in these units below which a direction is omitted.
+    """
+    size = np.sqrt(np.maximum(np.diag(covariance), 0.0)) if unit is None else unit
+    scale = np.where(size > 0, size, 1.0)
+    power, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = power > smallest * max(power.max(initial=0.0), 1e-300)
+    return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(power[kept]))

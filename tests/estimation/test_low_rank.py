@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.estimation.low_rank import whitener
+from errormotion.estimation.low_rank import root_of, whitener
 
 N, D = 7, 3
 SCALE = np.array([1e-6, 3e-6, 2e-5])
@@ -135,3 +135,14 @@ def test_a_factor_of_a_nearly_singular_block_is_that_of_its_eigenvectors(correla
         assert white.square(value) == pytest.approx(2 / (1 - correlation), rel=1e-6)
         expected = np.log(np.linalg.det(block / np.outer(SCALE, SCALE))) + 2 * N * np.log(SCALE).sum()
         assert white.log_determinant == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_root_of_a_covariance_has_as_many_columns_as_its_rank_whatever_the_units():
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(6, 3)) * np.array([1e-6, 1e-6, 1e-6, 5.0, 5.0, 0.0])[:, None]
+    R = root_of(A @ A.T)
+    assert R.shape == (6, 3)
+    size = np.sqrt(np.maximum(np.diag(A @ A.T), 1e-300))
+    np.testing.assert_allclose((R @ R.T) / np.outer(size, size), (A @ A.T) / np.outer(size, size), atol=1e-12)
+    assert (R[5] == 0).all()
+    assert root_of(np.zeros((3, 3))).shape == (3, 0)

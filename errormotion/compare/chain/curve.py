@@ -10,6 +10,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets.results.reduction import influence_of
+from errormotion.estimation.low_rank import root_of
 from errormotion.kinematics.iso import direction_of
 
 REFERENCE = "reference position"
@@ -37,8 +38,7 @@ class Curve:
         for j in np.flatnonzero((W != 0).any(axis=(0, 2))):
             effect = -W[:, j]
             effect[j] += 1.0
-            size = np.sqrt(np.diag(own[j]))
-            for k, part in enumerate(factor_of(own[j], np.where(size > 0, size, 1.0)).T):
+            for k, part in enumerate(root_of(own[j]).T):
                 rows.append(effect * part)
                 names.append(f"{REFERENCE} {j + 1}, part {k + 1}")
             own[j] = 0.0
@@ -85,14 +85,6 @@ def reference_weights(values: Sequence[Array], positions: Array, axis: str) -> A
 def is_straightness(dof: int, axis: str) -> bool:
     """Return whether a freedom is a displacement across the axis."""
     return dof < 3 and dof != direction_of(axis)
-
-
-def factor_of(matrix: Array, scale: Array) -> Array:
-    """Return R (n, part) with R R' = matrix; ``scale`` (n,) equalises the size of its rows."""
-    power, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    kept = power > 1e-12 * max(power.max(initial=0.0), 1e-300)
-    found: Array = scale[:, None] * vectors[:, kept] * np.sqrt(power[kept])
-    return found
 
 
 def sources_of(ds: xr.Dataset) -> tuple[list[str], list[str], list[str]]:

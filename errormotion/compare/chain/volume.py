@@ -20,11 +20,12 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from errormotion.arrays import Array
-from errormotion.compare.chain.curve import Curve, factor_of, is_straightness, sources_of
+from errormotion.compare.chain.curve import Curve, is_straightness, sources_of
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.errors import DatasetError
 from errormotion.estimation.evidence import eliminated, maximum_evidence
 from errormotion.estimation.information import weights
+from errormotion.estimation.low_rank import root_of
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import cross_matrix
 
@@ -210,7 +211,7 @@ def _with_coefficients(blank: _Fit, N: Array, b: Array, gain: Array, square: flo
     rest, degrees = max(square - float(b @ value), 0.0), max(count - int((group < 0).sum()), 1)
     factor = rest / degrees if special.chdtrc(degrees, rest) < FALSE_ALARM else 1.0
     shared = C @ gain
-    own = np.sqrt(factor) * factor_of(C - shared @ shared.T, np.sqrt(np.diag(C)))
+    own = np.sqrt(factor) * root_of(C - shared @ shared.T, unit=np.sqrt(np.diag(C)))
     size = np.sqrt(np.diag(N))
     unit = np.where(size > 1e-9 * size.max(), 1 / np.where(size > 0, size, 1.0), 1.0)
     low = np.flatnonzero((order <= DECISIVE_ORDER) | (group < 0))

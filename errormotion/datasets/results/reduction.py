@@ -13,6 +13,7 @@ from errormotion.arrays import Array, filled, products
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.datasets.timing import between
 from errormotion.errors import DatasetError
+from errormotion.estimation.low_rank import root_of
 
 REFERENCE = "reference state"
 """Group of the sources of the uncertainty of a reference state."""
@@ -275,14 +276,10 @@ def _sources_of(covariance: Array) -> Array:
     flat = covariance.reshape(-1, 6, 6)
     rows = []
     for i, matrix in enumerate(flat):
-        scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-        safe = np.where(scale > 0, scale, 1.0)
-        power, vectors = np.linalg.eigh(matrix / np.outer(safe, safe))
-        for size, vector in zip(power, vectors.T, strict=True):
-            if size > 1e-12:
-                row = np.zeros_like(flat[:, 0])
-                row[i] = np.sqrt(size) * vector * safe
-                rows.append(row.reshape(covariance.shape[:-1]))
+        for part in root_of(matrix).T:
+            row = np.zeros_like(flat[:, 0])
+            row[i] = part
+            rows.append(row.reshape(covariance.shape[:-1]))
     return np.array(rows) if rows else np.zeros((0, *covariance.shape[:-1]))
 
 

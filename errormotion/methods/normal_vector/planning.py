@@ -11,6 +11,7 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
+from errormotion.estimation.low_rank import root_of
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector.acquisition import touching
 from errormotion.methods.normal_vector.acquisition.cycle import TIP_RADIUS
@@ -56,7 +57,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     values = np.zeros((count, 6))
     values[:, unseen] = np.nan
     loss = _loss(seen, settings, motion, found.anchor, found.reach, covariance)
-    factors = _factors(covariance[-1] - found.own[-1])
+    factors = root_of(covariance[-1] - found.own[-1], smallest=1e-9).T
     influence = np.repeat(factors[:, None], count, axis=1)
     influence[:, 0] = 0.0
     ds = build_errors(
@@ -106,15 +107,6 @@ def _loss(
         measured.cofactor[0, four], measured.cofactor[1:2, four], motion.point, measured.centre[0, four]
     )
     return np.asarray(np.sqrt(np.diagonal(C[0]) / np.diagonal(covariance[1])))
-
-
-def _factors(shared: Array) -> Array:
-    """Return columns whose outer products sum to a covariance (6, 6): (source, 6)."""
-    u = np.sqrt(np.maximum(np.diagonal(shared), 0.0))
-    unit = np.where(u > 0, u, 1.0)
-    values, vectors = np.linalg.eigh(shared / np.outer(unit, unit))
-    significant = values > 1e-9
-    return np.asarray((vectors[:, significant] * np.sqrt(values[significant])).T * u)
 
 
 def _notes(settings: Settings, motion: Motion, covariance: Array, loss: Array, noise: float) -> list[str]:

@@ -10,6 +10,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
+from errormotion.estimation.low_rank import root_of
 from errormotion.methods.multilateration.identification.parameters import AXES, Chain, Parametric, Term, Undetermined
 
 if TYPE_CHECKING:
@@ -156,7 +157,7 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     A = _field(axes, q, at)
     values = A @ axes.coefficient
     unknown = ~(_known_dofs(axes, q, at) & _inside(axes, q)[:, None])
-    root = _root(axes.covariance)
+    root = root_of(axes.covariance, smallest=1e-14)
     influence = np.moveaxis(A @ root, 2, 0)
     values[unknown] = np.nan
     influence[:, unknown] = np.nan
@@ -231,10 +232,3 @@ def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
     if np.allclose(tool, axes.chain.reference, rtol=0, atol=1e-9):
         known[:, :3] = True
     return known
-
-
-def _root(covariance: Array) -> Array:
-    size = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-    kept = values > 1e-14 * values[-1]
-    return np.asarray(size[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
