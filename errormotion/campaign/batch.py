@@ -28,6 +28,7 @@ from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.datasets import provenance
 from errormotion.datasets.clock import noted
 from errormotion.datasets.files.hashing import has_hash
+from errormotion.datasets.files.reading import visible
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
 from errormotion.errors import DatasetError, ErrormotionError, RunError
@@ -206,7 +207,7 @@ def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
     """Return the runs of a method in a folder, with the reason for those that cannot be identified."""
     found: list[tuple[Path, str]] = []
     others: set[str] = set()
-    for path in sorted(file.parent for file in folder.glob("*/run.json") if not file.parent.name.startswith(".")):
+    for path in [file.parent for file in visible(folder, "*/run.json")]:
         try:
             data = RunFolder.open(path).data
         except RunError as error:

@@ -11,6 +11,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.storage.raw_paths import is_runs_folder
+from errormotion.datasets.files.reading import visible
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError, RunError
 
@@ -84,7 +85,7 @@ def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[st
         return [(str(folder.data["test"]), _errors(folder))]
     newest: dict[str, tuple[str, Path]] = {}
     everything: list[tuple[str, Path]] = []
-    for file in sorted(path.glob("*/run.json")):
+    for file in visible(path, "*/run.json"):
         try:
             folder = RunFolder.open(file.parent)
             test, created, errors = str(folder.data["test"]), str(folder.data["created"]), _errors(folder)

@@ -18,7 +18,7 @@ from errormotion.campaign.form.fields import Form, form_of, with_field, with_tes
 from errormotion.campaign.planning.expected import expected, planned
 from errormotion.campaign.planning.motions import Motions, beside_limits, headline, motions, picture
 from errormotion.dashboard.lab import NotFoundError
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import read_bytes, visible
 from errormotion.datasets.files.tomlfile import Key, parse_toml, read_toml
 from errormotion.datasets.files.tomltext import MAX_TEXT, value
 from errormotion.datasets.files.writing import replace_text
@@ -57,7 +57,7 @@ class Campaigns:
 
     def names(self) -> list[str]:
         """Return the names of the campaign files."""
-        examined = sorted(self.folder.glob("*.toml"))[:MAX_EXAMINED]
+        examined = visible(self.folder, "*.toml")[:MAX_EXAMINED]
         return [path.name for path in examined if _is_campaign(path)][:MAX_FILES]
 
     def read(self, name: str) -> str:

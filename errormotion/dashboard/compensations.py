@@ -25,6 +25,7 @@ from errormotion.compensation.online.audit import AuditReader
 from errormotion.compensation.online.prediction import predictor, predicts
 from errormotion.dashboard.cache import Cache, stamp
 from errormotion.datasets.files.containers import stated_schema
+from errormotion.datasets.files.reading import visible
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import CompensationError, ErrormotionError
 
@@ -233,7 +234,7 @@ def _files(folder: Path, ending: str) -> Sequence[Path]:
     """Return the first `MAX_FILES` files of a folder by name."""
     if not folder.is_dir():
         return ()
-    return sorted(path for path in folder.glob(f"*{ending}") if path.is_file())[:MAX_FILES]
+    return [path for path in visible(folder, f"*{ending}") if path.is_file()][:MAX_FILES]
 
 
 def _states(path: Path, schema: str) -> bool:

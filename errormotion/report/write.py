@@ -12,7 +12,7 @@ from typing import Any
 import xarray as xr
 
 from errormotion import plugins
-from errormotion.datasets.files.reading import leaves
+from errormotion.datasets.files.reading import leaves, visible
 from errormotion.datasets.files.writing import whole
 from errormotion.datasets.validation import validate
 from errormotion.errors import DatasetError, RunError
@@ -322,7 +322,7 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
     folder = Path(run_folder)
     if not folder.is_dir():
         raise RunError(f"Expected a run folder at {folder}; found none.")
-    files = [file for file in sorted(folder.glob("errors/*/errors.nc")) if not leaves(folder, file)]
+    files = [file for file in visible(folder, "errors/*/errors.nc") if not leaves(folder, file)]
     stored = folder / "raw.zarr"
     raw = load(stored) if stored.exists() and not leaves(folder, stored) else None
     log = raw if raw is not None and not files and _is_log(raw) else None

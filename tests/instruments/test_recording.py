@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ReplayError
-from errormotion.instruments.transports import Transport, open_transport
+from errormotion.instruments.transports import Transport, open_transport, parse_address
 from errormotion.instruments.transports.loopback.serving import make_server
 from errormotion.instruments.transports.recording import Recorder, read_index, read_recording, write_index
 
@@ -177,3 +177,20 @@ def test_an_instrument_of_several_lines_has_a_list_of_recordings(tmp_path: Path)
     (tmp_path / "other.rec").write_text("hello\n")
     with pytest.raises(ReplayError, match="not a list"):
         read_index(tmp_path / "other.rec")
+
+
+def test_a_recording_beyond_the_limit_is_refused_before_it_is_read(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("errormotion.instruments.transports.recording.MAX_RECORDING", recording.stat().st_size - 1)
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: pytest.fail("it was read"))
+    with pytest.raises(ReplayError, match="expected a recording of at most"):
+        read_recording(recording)
+
+
+@pytest.mark.parametrize("scheme", ["http", "tcp", "opc.tcp", "modbus+tcp", "can"])
+def test_an_address_with_a_password_is_refused_and_not_repeated(scheme: str) -> None:
+    """It would be stored in recordings, runs and reports."""
+    with pytest.raises(InstrumentError, match="without a user name and password") as found:
+        parse_address(f"{scheme}://user:top-secret@192.0.2.7:5000/a")
+    assert "top-secret" not in str(found.value)

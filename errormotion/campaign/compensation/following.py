@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from errormotion.campaign.folder import is_locked
 from errormotion.compensation.online.settings import Limits
-from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.files.reading import read_bytes, visible
 from errormotion.datasets.files.writing import open_to_append, replace_text
 from errormotion.errors import CompensationError
 
@@ -158,7 +158,7 @@ def is_working(folder: Path) -> bool:
 def compensations(runs: Path) -> Iterator[Path]:
     """Yield the run folders of compensations in a folder of runs, the newest first."""
     if runs.is_dir():
-        found = sorted((path.parent for path in runs.glob(f"*/{AUDIT}")), key=lambda path: path.name, reverse=True)
+        found = sorted((path.parent for path in visible(runs, f"*/{AUDIT}")), key=lambda path: path.name, reverse=True)
         yield from found[:MAX_COMPENSATIONS]
 
 

@@ -30,6 +30,7 @@ from errormotion.datasets.calibrations import owner
 from errormotion.datasets.calibrations.dataset import Calibration, assemble, table_violations
 from errormotion.datasets.calibrations.tilt_support import Hole, TiltSupport
 from errormotion.datasets.files.folders import folders_beside
+from errormotion.datasets.files.reading import visible
 from errormotion.datasets.provenance import hash_dataset
 from errormotion.datasets.schemas import Row
 from errormotion.errors import DatasetError, MethodError
@@ -182,7 +183,7 @@ class InclinationCalibration(Calibration):
         for place in places:
             if place.exists():
                 return cls.load(place)
-        there = sorted({path.stem for home in homes if home.is_dir() for path in home.glob("*.nc")})
+        there = sorted({path.stem for home in homes if home.is_dir() for path in visible(home, "*.nc")})
         known = f" Calibrations there: {', '.join(there)}." if there else ""
         raise DatasetError(
             f"calibration '{name}': not found. Searched: {', '.join(map(str, places))}.{known} Give a path, or copy "

@@ -38,6 +38,18 @@ def leaves(folder: Path, path: Path) -> bool:
         return True
 
 
+def visible(folder: Path, pattern: str) -> list[Path]:
+    """Return the files and folders of a pattern, sorted, without those in or behind a hidden name.
+
+    Temporary files and folders are hidden, and a power cut may leave them incomplete.
+    """
+    return sorted(
+        path
+        for path in folder.glob(pattern)
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+
+
 def read_bytes(path: str | Path, longest: int) -> bytes:
     """Return the content of a regular file.
 

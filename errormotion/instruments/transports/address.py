@@ -108,7 +108,7 @@ def parse_address(url: str) -> Address:
     Raises
     ------
     InstrumentError
-        Unknown scheme, a required host, port or path is missing, or a parameter has no value.
+        Unknown scheme, a required host, port or path is missing, a parameter has no value, or it has a password.
     """
     scheme, mark, rest = url.partition("://")
     if not mark or scheme not in SCHEMES:
@@ -131,6 +131,11 @@ def parse_address(url: str) -> Address:
         raise InstrumentError(
             f"The address '{url}' cannot be read: {error}; expected an address such as {_EXAMPLES}"
         ) from None
+    if "@" in parts.netloc:  # it would be stored in recordings, runs and reports
+        raise InstrumentError(
+            f"Expected an address without a user name and password, which no driver sends, as in {scheme}://"
+            f"{parts.netloc.rpartition('@')[2]}; found one with '@'"
+        )
     serial = scheme in ("serial", "modbus+rtu")
     path = parts.path if serial else parts.path.removeprefix("/") if scheme == CAN else parts.path.strip("/")
     if scheme == "modbus+tcp" and port is None:

@@ -47,6 +47,10 @@ MAX_INDEX = MAX_NOTE_BYTES + (1 << 16)
 """Largest size of a list of recordings, bytes."""
 
 
+MAX_RECORDING = 1 << 30
+"""Largest size of a recording that is replayed, bytes; a replay keeps its frames in memory."""
+
+
 class EndOfRecordingError(ReplayError):
     """The driver reads after the end of the recording."""
 
@@ -134,7 +138,8 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
         The file does not exist, is not a recording, was changed or has no end; the message states the line.
     """
     try:
-        require_regular(path)
+        if (size := require_regular(path).st_size) > MAX_RECORDING:
+            raise ReplayError(f"{path}: expected a recording of at most {MAX_RECORDING} bytes; found {size}")
         lines = path.read_text(encoding="ascii").splitlines()
     except OSError as error:
         raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None

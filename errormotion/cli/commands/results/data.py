@@ -20,6 +20,7 @@ from errormotion.cli.progress import Bars
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.cli.tolerances import end_with, lines_of, remarks
 from errormotion.datasets.clock import noted
+from errormotion.datasets.files.reading import visible
 from errormotion.datasets.results.merit import figures_of
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
@@ -365,7 +366,7 @@ def _of_run(path: Path) -> list[str]:
     except ErrormotionError as error:
         return [str(error)]
     found = []
-    for part in ([folder.raw] if folder.raw.exists() else []) + sorted(path.glob("errors/*/errors.nc")):
+    for part in ([folder.raw] if folder.raw.exists() else []) + visible(path, "errors/*/errors.nc"):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
     found += events.read(path)[1]
     if folder.finished and folder.errors is None:
