@@ -135,11 +135,10 @@ def test_a_freedom_that_is_zero_has_no_wrong_sign():
 
 
 def test_an_alarm_without_a_cause_says_that_none_is_known():
-    rng = np.random.default_rng(7)
-    for _ in range(100):
-        found = compare({each: made(each, rng) for each in "ab"})
-        if found["p"].item() < 0.05 and not found["cause"].values[0, 0]:
-            break
+    rng = np.random.default_rng(24)  # p is 0.02
+    found = compare({each: made(each, rng) for each in "ab"})
+    assert found["p"].item() < 0.05
+    assert not found["cause"].values[0, 0]
     assert "a - b: none of the known causes explains the difference better than chance." in verdict(found)
     assert found.attrs["searched"].tolist() == [1]
 
