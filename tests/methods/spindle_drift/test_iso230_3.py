@@ -122,10 +122,10 @@ def test_the_value_at_the_end_does_not_lag_behind_the_drift():
         assert value(found, "Z", measure) == pytest.approx(10e-6, abs=1e-12)
 
 
-def test_a_mean_across_the_end_of_running_is_left_out():
+@pytest.mark.parametrize("end", [3661.0, 3663.0])  # within a mean of 4 s, before and after its middle
+def test_a_mean_across_the_end_of_running_is_left_out(end):
     t = np.arange(2.0, 4400.0, 4.0)
     errors = drift(t)
-    end = 3661.0  # within a mean of 4 s
     errors[t + 2.0 > end, 2] += 27e-6 * np.clip((t[t + 2.0 > end] + 2.0 - end) / 4.0, 0.0, 1.0)
     found = results(t, errors, running_end=end, mean=4.0)
     smooth = 20e-6 * -np.expm1(-end / 1500)
@@ -133,16 +133,17 @@ def test_a_mean_across_the_end_of_running_is_left_out():
         assert value(found, "Z", measure) == pytest.approx(smooth, abs=0.03e-6)
 
 
-def test_no_mean_of_a_range_contains_a_switched_compensation():
-    t = np.arange(0, 4400.0, 1.0)
+@pytest.mark.parametrize("at", [4011.0, 4009.0])  # within a mean of 4 s, after and before its middle
+@pytest.mark.parametrize("mean", [0.0, 4.0])
+def test_no_mean_of_a_range_contains_a_switched_compensation(mean, at):
+    t = np.arange(2.0, 4400.0, mean or 1.0)
     errors = np.zeros((t.size, 6))
-    errors[:, 2] = 10e-6 * t / 4000.0
-    at = 4011.0
-    errors[t > at, 2] -= 30e-6
-    found = results(t, errors, changes=[at])
+    after = np.clip((t - at) / mean + 0.5, 0.0, 1.0) if mean else t > at
+    errors[:, 2] = 10e-6 * t / 4000.0 - 30e-6 * after
+    found = results(t, errors, mean=mean, changes=[at])
     peak, low = 10e-6 * at / 4000.0, 10e-6 * (at + 1) / 4000.0 - 30e-6
-    # Half a minute of the drift, 2.5 nm/s, at the peak and after it.
-    assert value(found, "Z", "range_total") == pytest.approx(peak - low, abs=2 * 15 * 2.5e-9)
+    # The drift, 2.5 nm/s, from the middle of half a minute to the switch and after it, and in the mean that is left out.
+    assert value(found, "Z", "range_total") == pytest.approx(peak - low, abs=2 * (15 + mean) * 2.5e-9)
 
 
 def test_noise_widens_a_range_less_than_its_uncertainty():
