@@ -10,7 +10,7 @@ import pytest
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan
 from errormotion.campaign.folder import RunFolder, list_runs
-from errormotion.datasets.files import events
+from errormotion.datasets.files import events, writing
 from errormotion.errors import RunError
 from errormotion.report import write_run_report
 from errormotion.report.page import logo
@@ -60,6 +60,20 @@ def test_links_in_place_of_written_files_are_replaced_or_left(unfinished, home: 
     done.give_reserve()
     assert done.finished
     assert not write_run_report(done.path).is_symlink()
+
+
+def test_a_temporary_file_has_another_name_each_time_and_is_never_an_existing_one(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = set()
+    for _ in range(2):
+        with writing.replacing(tmp_path / "a") as part:
+            names.add(part.name)
+    assert len(names) == 2
+    monkeypatch.setattr(writing.secrets, "token_hex", lambda count: "0" * 2 * count)
+    (tmp_path / f".a.{16 * '0'}.part").symlink_to(home / "mine.txt")
+    with pytest.raises(FileExistsError):
+        writing.replace_bytes(tmp_path / "a", b"not mine")
 
 
 @pytest.mark.parametrize("name", ["log.jsonl", "errors", "errors/ramp-{hash}", "errors/ramp-{hash}/errors.nc"])

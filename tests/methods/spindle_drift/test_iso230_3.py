@@ -142,7 +142,7 @@ def test_no_mean_of_a_range_contains_a_switched_compensation(mean, at):
     errors[:, 2] = 10e-6 * t / 4000.0 - 30e-6 * after
     found = results(t, errors, mean=mean, changes=[at])
     peak, low = 10e-6 * at / 4000.0, 10e-6 * (at + 1) / 4000.0 - 30e-6
-    # The drift, 2.5 nm/s, from the middle of half a minute to the switch and after it, and in the mean that is left out.
+    # The drift, 2.5 nm/s, between the switch and the middles of half a minute, and in the mean that is left out.
     assert value(found, "Z", "range_total") == pytest.approx(peak - low, abs=2 * (15 + mean) * 2.5e-9)
 
 
