@@ -90,14 +90,10 @@ lock:  ## resolve the requirements in pyproject.toml into the two lock files (ne
 	@tools/setup dev
 
 # Functions that are compiled at first use are compiled once, before the workers of the tests start.
-compiled: .venv/.compiled .venv/.compiled-large
+compiled: .venv/.compiled
 
 COMPILED := $(shell grep -rlsE 'njit|@compiled' --include='*.py' errormotion)
 
 .venv/.compiled: .venv/.dev $(COMPILED)
 	$(BIN)/python tools/precompile
-	@touch $@
-
-.venv/.compiled-large: .venv/.dev $(COMPILED)
-	$(BIN)/python tools/precompile --large
 	@touch $@

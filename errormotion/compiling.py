@@ -2,7 +2,7 @@
 
 A module declares its functions with a `Compiler`:
 
-    compiled = Compiler("the loops for large networks", seconds=20)
+    compiled = Compiler("the loops for large campaigns", seconds=5)
 
     @compiled(fastmath=True)
     def add(x, y): ...
@@ -37,7 +37,7 @@ class Compiler:
     Parameters
     ----------
     what : str
-        The group for the message on the terminal: ``the loops for large networks``.
+        The group for the message on the terminal: ``the loops for large campaigns``.
     seconds : float
         Typical time of the compilation, s.
     **options

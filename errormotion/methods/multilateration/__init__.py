@@ -6,9 +6,9 @@ known errors.
 
 ``network`` solves for targets and stations: ``model`` (the equations), ``start`` (approximate stations), ``descent``
 (Gauss-Newton with every target eliminated), ``turning`` (the datum), ``outliers`` (wrong readings), ``determinacy``
-(undetermined freedoms), ``network`` (result and covariances), over ``loops`` (array operations for small networks,
-compiled loops for large networks). Source: Takeuchi et al., estimation of three-dimensional volumetric errors of
-numerically controlled machine tools by a laser tracker.
+(undetermined freedoms), ``network`` (result and covariances), over ``target_sums`` (array operations). Source:
+Takeuchi et al., estimation of three-dimensional volumetric errors of numerically controlled machine tools by a laser
+tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.loops import loops
+from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.model import Stations, directions, motions
 
 
@@ -126,7 +126,7 @@ class Network:
     datum: Datum = field(default=cast(Any, _OnDemand()), repr=False)
 
     def _calculated_datum(self) -> Datum:
-        GG, GDG, GF = loops(len(self.target)).datum_sums(
+        GG, GDG, GF = target_sums.datum_sums(
             self.weight, self.station, self.extra, self.target, self.in_datum, self.centre
         )
         H = np.asarray(np.linalg.inv(GG), dtype=np.float64)
@@ -156,13 +156,14 @@ class Network:
         The residual of an outlier is its whole error, since it did not contribute to the position.
         """
         s = self.stations
-        of = loops(len(self.target))
-        return np.asarray(of.residuals(self.reading, s.position, s.dead_path, self.extra, s.value, self.target))
+        return np.asarray(
+            target_sums.residuals(self.reading, s.position, s.dead_path, self.extra, s.value, self.target)
+        )
 
     @cached_property
     def _examined(self) -> tuple[Array, Array]:
         datum = self.datum
-        covariance, redundancy = loops(len(self.target)).examine(
+        covariance, redundancy = target_sums.examine(
             self.weight, self.station, self.extra, self.target, self.in_datum,
             datum.centre, datum.factor, datum.shift, datum.H, datum.K,
         )  # fmt: skip

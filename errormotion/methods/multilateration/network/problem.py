@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.loops import loops
+from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.model import Stations
 
 
@@ -63,9 +63,8 @@ class Problem:
 
     def weighted(self, weight: Array) -> Problem:
         """Return the problem with other weights (n, m); a target with fewer than three readings has no position."""
-        count = loops(weight.shape[1]).count
-        weight[:, count(weight)[0] < 3] = 0.0
-        by_target, by_station = count(weight)
+        weight[:, target_sums.count(weight)[0] < 3] = 0.0
+        by_target, by_station = target_sums.count(weight)
         return replace(self, weight=weight, by_target=by_target, by_station=by_station)
 
     def sample(self, every: int) -> Problem:
@@ -73,7 +72,7 @@ class Problem:
         part = slice(every // 2, None, every)
         reading, weight = (np.ascontiguousarray(a[:, part]) for a in (self.reading, self.weight))
         extra = np.ascontiguousarray(self.extra[:, :, part])
-        by_target, by_station = loops(weight.shape[1]).count(weight)
+        by_target, by_station = target_sums.count(weight)
         return replace(
             self, reading=reading, weight=weight, extra=extra, nominal=self.nominal[part].copy(),
             by_target=by_target, by_station=by_station,
@@ -85,7 +84,7 @@ class Problem:
 
     def reduce(self, stations: Stations, position: Array) -> Sums:
         """Move the targets (3, m) in place and return their sums for the stations."""
-        sums, moved = loops(position.shape[1]).reduce_targets(
+        sums, moved = target_sums.reduce_targets(
             self.reading, self.weight, stations.position, stations.dead_path, self.extra, stations.value, position
         )
         H, h, square = sums[:-1, :-1].copy(), sums[:-1, -1].copy(), float(sums[-1, -1])
@@ -125,8 +124,7 @@ def state_problem(
             "State a row of displacements for every station and a position for every target."
         )
     n, m = d.shape
-    of = loops(m)
-    u, centre = of.copied(np.ascontiguousarray(u))
+    u, centre = target_sums.copied(np.ascontiguousarray(u))
     if not np.isfinite(centre).all():
         raise MethodError("Expected a nominal position for every target; found NaN. Remove such targets.")
     sigma = np.asarray(noise, dtype=float)
@@ -138,8 +136,8 @@ def state_problem(
             "each station, or each reading."
         )
     sigma = np.ascontiguousarray(np.broadcast_to(sigma, (n, 1)) if sigma.ndim == 0 else sigma)
-    reading, weight, positive = of.weigh(np.ascontiguousarray(d), sigma)
-    by_target, by_station = of.count(weight)
+    reading, weight, positive = target_sums.weigh(np.ascontiguousarray(d), sigma)
+    by_target, by_station = target_sums.count(weight)
     if not positive:
         raise MethodError("Expected a positive standard deviation of every reading. State the instrument's noise, m.")
     c = np.zeros((0, n, m)) if extra is None else np.nan_to_num(np.asarray(extra, dtype=float))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.loops import loops
+from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.model import Stations
 
 
@@ -22,7 +22,7 @@ class Motion:
 
     @classmethod
     def of(cls, moments: Array, centre: Array) -> Motion:
-        """Return the best fit of targets to nominal ones, from their moments (16,) (see `vectorised.moments`).
+        """Return the best fit of targets to nominal ones, from their moments (16,) (see `target_sums.moments`).
 
         The rotation is that of Kabsch, from the singular vectors of the cross products.
         """
@@ -43,7 +43,6 @@ def fitted(stations: Stations, target: Array, nominal: Array, used: NDArray[np.b
     Only the targets ``used`` (m,) determine the fit.
     """
     position, centre = np.ascontiguousarray(target.T), nominal.mean(axis=0)
-    of = loops(len(target))
-    motion = Motion.of(of.moments(position, nominal, used, centre), centre)
+    motion = Motion.of(target_sums.moments(position, nominal, used, centre), centre)
     everywhere = np.zeros(len(target))
-    return motion.stations(stations), of.moved(position, motion.a, motion.b, motion.R, everywhere), motion.R
+    return motion.stations(stations), target_sums.moved(position, motion.a, motion.b, motion.R, everywhere), motion.R

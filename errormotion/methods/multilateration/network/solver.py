@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
+from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.descent import State, descend
 from errormotion.methods.multilateration.network.diagnosis import determinacy, outliers
 from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets
-from errormotion.methods.multilateration.network.loops import loops
 from errormotion.methods.multilateration.network.model import Stations
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import Problem, state_problem
@@ -145,24 +145,23 @@ def conclude(
         The distances leave a freedom undetermined.
     """
     position, free = state.position, state.stations
-    of = loops(position.shape[1])
-    traces, sums = of.settle_targets(
+    traces, sums = target_sums.settle_targets(
         problem.reading, problem.weight, free.position, free.dead_path, problem.extra, free.value,
         position, problem.nominal, problem.centre,
     )  # fmt: skip
     in_datum = datum_targets(traces)
     if np.count_nonzero(in_datum) != sums[0]:
-        sums = of.moments(position, problem.nominal, in_datum, problem.centre)
+        sums = target_sums.moments(position, problem.nominal, in_datum, problem.centre)
     some = slice(None, None, max(1, position.shape[1] // DATUM_SAMPLE))
     determinacy.refuse_not_finite(position[:, some], state.sums.H, sums)
     determinacy.refuse_flat(int(sums[0]), start, position[:, some].T)
     motion = Motion.of(sums, problem.centre)
-    stations, target = motion.stations(free), of.moved(position, motion.a, motion.b, motion.R, traces)
+    stations, target = motion.stations(free), target_sums.moved(position, motion.a, motion.b, motion.R, traces)
     Z = problem.basis(stations, motion.b)
     information = _within(state.sums.H, Z, motion.R, len(start))
     # Undetermined freedoms are detected in the datum of some of the targets.
     sample = np.flatnonzero(in_datum)[:: max(1, int(sums[0]) // DATUM_SAMPLE)]
-    GG, _, GF = loops(len(sample)).datum_sums(
+    GG, _, GF = target_sums.datum_sums(
         problem.weight[:, sample],
         stations.position,
         problem.extra[:, :, sample],

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network import vectorised
+from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.descent import State
 from errormotion.methods.multilateration.network.diagnosis import determinacy
 from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets
@@ -76,17 +76,17 @@ def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array
     None if a freedom is undetermined. Stations and dead paths are unknown; the covariances are those of `examine`.
     """
     weight = np.where(np.count_nonzero(weight, axis=0) >= 3, weight, 0.0)
-    e, D, whole = vectorised.seen(weight, station, target)
+    e, D, whole = target_sums.seen(weight, station, target)
     own = np.einsum("aam->m", D)
     used = whole & datum_targets(np.where(whole, own, np.inf))
     if np.count_nonzero(used) < 3:
         return None
-    N = vectorised.orthogonal_rows(weight[:, None] * e)
-    V = vectorised.equations(N * weight, e)
+    N = target_sums.orthogonal_rows(weight[:, None] * e)
+    V = target_sums.equations(N * weight, e)
     n, centre = len(station), target[used].mean(axis=0)
     stations = Stations(station, np.zeros(n), np.zeros(0))
     Z = stations.complement(centre, np.ones(4 * n, dtype=bool))
-    G, F = motions(target, centre), vectorised.response(weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e), e)
+    G, F = motions(target, centre), target_sums.response(weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e), e)
     flat = G[used].reshape(-1, 6)
     H = np.linalg.inv(flat.T @ flat)
     shift = H @ (flat.T @ F[used].reshape(len(flat), -1))

@@ -16,7 +16,6 @@ from scipy.special import ndtri
 
 from errormotion.arrays import Array
 from errormotion.estimation.robust import NORMAL_MAD, scale_about_zero
-from errormotion.methods.multilateration.network.loops import COMPILED_FROM, loops
 from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.network.network import Network
 
@@ -76,22 +75,7 @@ def normalised(network: Network) -> Array:
 def gate(t: Array) -> float:
     """Return the normalised residual above which a reading is an outlier, from all (n, m)."""
     scale = max(1.0, scale_about_zero(t))
-    return scale * _least_gate(int(np.count_nonzero(np.isfinite(t))))
-
-
-def _least_gate(checks: int) -> float:
-    return -float(ndtri(0.5 * FALSE_ALARMS / max(checks, 1)))
-
-
-def _clean(network: Network) -> bool:
-    """Return whether no reading exceeds the lowest gate, with the stated noise: a fast check of large networks."""
-    if len(network.target) < COMPILED_FROM or len(network.station) != 4 or len(network.extra):
-        return False
-    checks, worst = loops(len(network.target)).screen_targets(
-        network.reading, network.weight, network.station, network.dead_path, np.ascontiguousarray(network.target.T),
-        network.factor, _MIN_REDUNDANCY,
-    )  # fmt: skip
-    return bool(worst <= _least_gate(checks))
+    return -scale * float(ndtri(0.5 * FALSE_ALARMS / max(int(np.count_nonzero(np.isfinite(t))), 1)))
 
 
 def gross(reading: Array, weight: Array, nominal: Array, position: Array, dead_path: Array) -> Outliers:
@@ -122,8 +106,6 @@ def search(network: Network, weight: Array, nominal: Array, before: Outliers) ->
     before : Outliers
         Known outliers.
     """
-    if _clean(network):
-        return before
     with np.errstate(invalid="ignore"):
         t = np.abs(normalised(network))
     if not np.isfinite(t).any():

@@ -1,4 +1,4 @@
-"""Sums over the targets of a small network, by array operations. `kernels` has the same functions for large ones.
+"""Sums over the targets of a network, by array operations.
 
 With E (n, 3) the weighted directions from the stations to a target, N orthonormal rows with N E = 0, and Q the weighted
 derivatives of the readings by the parameters of the stations, a target contributes the n - 3 equations N Q ds = N r.
