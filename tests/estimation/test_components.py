@@ -163,6 +163,7 @@ def test_missing_readings_and_a_stated_noise() -> None:
     assert stated.fit.problem.noise is problem.noise
 
 
+@pytest.mark.slow
 def test_variances_are_covered_by_their_information() -> None:
     """Mean and standard deviation of the estimates over seeds, against the truth and the information."""
     found = [components(positioning(12, 9, seed, sizes=np.array([3e-6, 2e-6, 1e-6, 1e-6]))[0]) for seed in range(100)]
@@ -173,6 +174,7 @@ def test_variances_are_covered_by_their_information() -> None:
     assert variance.std(axis=0) == pytest.approx(sd, rel=0.3)  # 100 seeds: 7 %, and the spread of the variance itself
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 0.3, 2.0])
 def test_the_mean_of_few_runs_is_covered(size: float) -> None:
     """Five runs: Student's factor of the degrees of freedom of its variance, for offsets from none to large."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
@@ -58,6 +59,10 @@ class Numbers:
         Part of the information on an error that the fit leaves; the smallest one of a whole reading.
     """
 
+    gain: Array
+    tested: NDArray[np.bool_]
+    redundancy: Array
+
     def __init__(self, fit: Fit, whole: bool) -> None:
         linear = fit.linear
         used, r = linear.used, linear.residual
@@ -71,7 +76,7 @@ class Numbers:
             kept = values > MIN_REDUNDANCY
             along = np.einsum("nij,ni->nj", vectors, r)
             self.gain = np.sum(along**2 * kept / np.where(kept, values, 1.0), axis=1, keepdims=True)
-            self.tested = kept.any(axis=1, keepdims=True)
+            self.tested = np.any(kept, axis=1, keepdims=True)
             values[:, :m] = np.where(np.arange(m) < m - used.sum(axis=1)[:, None], 1.0, values)
             self.redundancy = np.where(self.tested, values.min(axis=1, keepdims=True), 0.0)
             return
