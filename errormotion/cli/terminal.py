@@ -13,7 +13,7 @@ from rich.segment import Segment
 from errormotion.cli.output import printable
 
 QUIET = 0.2
-"""Time without input after which a question counts as seen, s: what was typed or pasted before it has then arrived."""
+"""Time without input before a question is shown, s: what was typed or pasted before it has then arrived."""
 QUIET_TIMEOUT = 5.0
 """Longest time for which input before a question is discarded, s."""
 
@@ -35,10 +35,12 @@ class Terminal(Console):
         What was typed or pasted before the question appeared is discarded: nobody has answered a question before it
         was asked.
         """
+        of_person = sys.stdin.isatty()
+        quiet = not of_person or _discard_typed()
         self.print(question, markup=False, soft_wrap=True, end="")
-        if not sys.stdin.isatty():
+        if not of_person:
             return sys.stdin.readline()
-        if not _discard_typed():
+        if not quiet:
             self.print("\nThe input did not pause before the question.")
             return ""
         with open(sys.stdin.fileno(), encoding=sys.stdin.encoding, errors="replace", closefd=False) as typed:
