@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -102,17 +101,3 @@ def test_a_name_in_a_file_cannot_control_the_terminal(tmp_path: Path, capfd) -> 
     shown = capfd.readouterr()
     assert r"\x1b]0;x\x07" in shown.err
     assert "\x1b" not in shown.out + shown.err
-
-
-def test_without_a_state_folder_no_log_is_written_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
-) -> None:
-    victim, state = tmp_path / "victim", tmp_path / "state"
-    state.write_text("a file where the folder should be")
-    victim.write_text("mine")
-    (tmp_path / "errormotion.log").symlink_to(victim)
-    monkeypatch.setenv("XDG_STATE_HOME", str(state))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with pytest.raises(SystemExit):
-        main(["bench", "validate", str(tmp_path / "none.toml")])
-    assert victim.read_text() == "mine"

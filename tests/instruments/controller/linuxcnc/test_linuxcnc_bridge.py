@@ -345,9 +345,14 @@ def test_the_name_of_the_holder_gives_no_right(play: Callable[[Test], None], sec
 
 def test_no_answer_contains_a_secret(play: Callable[[Test], None]) -> None:
     async def test(wire: Wire, fake: FakeLinuxCNC, bridge: Bridge) -> None:
-        holder = Wire(bridge, control=False, secret=SECRET)
-        answers = [holder.welcome]
-        answers += [await holder.ask(op) for op in ("identify", "state", "offset", "enable", SECRET[:8])]
+        bridge.compensates = True
+        await wire.disconnect()
+        holder = Wire(bridge, secret=SECRET, compensate=True)
+        stranger = Wire(bridge, control=False, client="another")
+        answers = [holder.welcome, stranger.welcome]
+        for each in (holder, stranger):
+            answers += [await each.ask(op) for op in ("identify", "state", "offset", "enable", SECRET[:8])]
+        assert stranger.welcome["result"]["controlled_by"]
         assert SECRET not in json.dumps(answers)
         assert TOKEN not in json.dumps(answers)
 
