@@ -112,3 +112,13 @@ def test_foreign_texts_are_no_formulas(run: Run, tmp_path: Path) -> None:
     texts = [each.text for each in sheet.iter(f"{{{NS['m']}}}t")]
     assert {"=1+1", "<b>&", "EX / um"} <= set(texts)
     assert not list(sheet.iter(f"{{{NS['m']}}}f"))
+
+
+@pytest.mark.parametrize("software", ["3", "[1]", "null", '{"a": [[]]}'])
+def test_software_of_another_type_in_a_foreign_file_is_no_internal_error(
+    run: Run, tmp_path: Path, software: str
+) -> None:
+    found = errors()
+    found.attrs["provenance"] = f'{{"software": {software}}}'
+    datasets.save(found, tmp_path / "errors.nc")
+    run("export", "errors.nc", "-o", "out.xlsx")

@@ -100,8 +100,9 @@ def _about(errors: xr.Dataset, k: float) -> Sheet:
         if name == "functional_point":
             rows.append(["functional point / mm", ", ".join(f"{1e3 * each:.6g}" for each in np.asarray(value, float))])
         elif name == "provenance":
-            software = json.loads(value).get("software", {})
-            rows += [[f"software {key}", str(version)] for key, version in software.items()]
+            software = json.loads(value).get("software")
+            if isinstance(software, dict):  # of a file from anywhere
+                rows += [[f"software {key}", str(version)] for key, version in software.items()]
         else:
             listed = value.tolist() if isinstance(value, np.ndarray) else value
             rows.append([str(name), ". ".join(map(str, listed)) if isinstance(listed, list) else str(listed)])
