@@ -385,6 +385,7 @@ class _Session:
         if test.certificates:
             attrs[ATTRIBUTE] = json.dumps(dict(test.certificates))
         own = self._set_clock(folder, test)
+        self._restore(folder)
         bench.set_limits(forbidden(self.campaign, test))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
@@ -431,6 +432,18 @@ class _Session:
         clock = folder.data["clock"]
         control.follow(clock["schedule"], clock["time"])
         return {"start": later(clock["start"], clock["time"])}
+
+    def _restore(self, folder: RunFolder) -> None:
+        """Set a virtual machine of another process to the state in which the test found it, which a new test stores."""
+        drivers = [answer.driver for answer in self.bench.answers]
+        found = [each for each in drivers if hasattr(each, "snapshot") and each.settings.arm]
+        if self.campaign.timeline is not None or not found:
+            return
+        [control, *_] = found
+        if "machine" not in folder.data:
+            folder.save(machine=control.snapshot())
+        elif float(control.state()["time"]) < float(folder.data["machine"]["time"]):
+            control.restore(**folder.data["machine"])
 
     def _identify(self, folder: RunFolder, test: TestPlan) -> None:
         self.progress.stage("identifying")

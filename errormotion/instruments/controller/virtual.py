@@ -198,16 +198,39 @@ class VirtualController(Driver):
         self._change("follow", schedule=self._events(schedule), time=float(time))
 
     def snapshot(self) -> dict[str, Any]:
-        """Return ``time`` (s), ``position`` (m) and ``programs`` (number started) of axes at rest, for `restore`."""
-        return self._facts("snapshot", "time", "position", "programs")
+        """Return the state of axes at rest and the commands to the machine, for `restore`.
 
-    def restore(self, time: float, position: Sequence[float], programs: int) -> None:
-        """Set clock and axes as they were in another process at a `snapshot`; the heat is not changed.
+        ``time`` (s), ``position`` (m), ``programs`` (number started), ``readings`` (number by command), ``settings``
+        (number of targets), ``tool``, ``noise`` (state of the noise of each device) and ``schedule``.
+        """
+        return self._facts(
+            "snapshot", "time", "position", "programs", "readings", "settings", "tool", "noise", "schedule"
+        )
+
+    def restore(
+        self,
+        time: float,
+        position: Sequence[float],
+        programs: int,
+        readings: int = 0,
+        settings: int = 0,
+        tool: str = "",
+        noise: Mapping[str, Any] | None = None,
+        schedule: Iterable[Any] | None = None,
+    ) -> None:
+        """Set clock, axes and commands as they were in another process at a `snapshot`.
 
         The times of motions after a command are random. They follow from the number of programs, so that a test that is
         continued in another process equals one without interruption.
         """
-        self._change("restore", time=float(time), position=[float(x) for x in position], programs=int(programs))
+        state: dict[str, Any] = {"time": float(time), "position": [float(x) for x in position], "tool": str(tool)}
+        state |= {
+            "programs": int(programs),
+            "readings": int(readings),
+            "settings": int(settings),
+            "noise": dict(noise or {}),
+        }
+        self._change("restore", **state, **({} if schedule is None else {"schedule": self._events(schedule)}))
 
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""

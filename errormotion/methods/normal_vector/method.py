@@ -23,7 +23,7 @@ class NormalVector:
         id="normal_vector",
         summary="Thermal error from balls on the table, touched by the machine's own probe while it warms up",
         status="simulated_only",
-        version="1",
+        version="2",
         cannot_see=(
             "a tilt of the spindle relative to the last axis: the tip keeps its position in the spindle, so that all "
             "balls appear displaced equally",

@@ -39,7 +39,7 @@ class TargetStand:
         self.target: Target | None = None
         self.requested: dict[str, Any] | None = None
         self._machine = machine
-        self._settings = 0  # each setting of the gauge has other deviations
+        self.settings = 0  # each setting of the gauge has other deviations
 
     def put(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
         """Place ``"plane"`` (with its angles, rad) or ``"bar"`` in front of the sensors, or remove the target (None).
@@ -57,13 +57,13 @@ class TargetStand:
                 f"Expected inclination and rotation (rad) only with a plane; found {kind!r}, {inclination}, {rotation}"
             )
         if inclination is not None and rotation is not None:
-            face = self._machine.sine_gauge.face(float(inclination), float(rotation), self._settings)
+            face = self._machine.sine_gauge.face(float(inclination), float(rotation), self.settings)
             self.target = face
             self.requested = {"kind": kind, "inclination": float(inclination), "rotation": float(rotation)}
         else:
             self.target = self._machine.check_bar if kind == "bar" else None
             self.requested = {"kind": kind} if kind else None
-        self._settings += 1
+        self.settings += 1
 
     def read(self, name: str, times: Array, stage: Array, first: int, measuring_range: float | None = None) -> Array:
         """Return the readings of a sensor.
@@ -91,7 +91,7 @@ class TargetStand:
         sensor = self._machine.point_sensor
         if measuring_range is not None:
             sensor = sensor.from_start(measuring_range)
-        key = (self._settings, *name.encode())
+        key = (self.settings, *name.encode())
         return self._machine.point_readings(times, stage, self.target, sensor=sensor, first=first, key=key, beyond=True)
 
     def samples(self, streams: Sequence[Stream], first: int, n: int, rate: float, path: Path) -> Array:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -153,15 +153,46 @@ class VirtualWorld(Motion):
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the axes at rest, from which the times of later motions follow: see `restore`."""
-        return {"time": self.time, "position": self.position(), "programs": self._programs}
+        return {
+            "time": self.time,
+            "position": self.position(),
+            "programs": self._programs,
+            "readings": self._readings,
+            "settings": self.stand.settings,
+            "tool": self.tool,
+            "noise": {name: rng.bit_generator.state for name, rng in self._noise().items()},
+            "schedule": [_stated(event) for event in self.machine.state.schedule.events],
+        }
 
-    def restore(self, time: float, position: Sequence[float], programs: int) -> None:
-        """Set the clock, the axes and the number of started programs as in another process; the heat is not changed."""
+    def restore(
+        self,
+        time: float,
+        position: Sequence[float],
+        programs: int,
+        readings: int = 0,
+        settings: int = 0,
+        tool: str = "",
+        noise: Mapping[str, Any] | None = None,
+        schedule: Sequence[Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Set the state of a `snapshot` in another process; the heat is not changed without its ``schedule``."""
         with self._change:
             self._refuse_while_streaming("set the clock")
             self._refuse_in_alarm()
+            if schedule is not None and self._follows is None:
+                self.machine.start([Event(**event) for event in schedule])
             self._restart(float(time), tuple(map(float, position)))
-            self._programs = int(programs)
+            self._programs, self._readings, self.tool = int(programs), int(readings), tool or self.tool
+            self.stand.settings = int(settings)
+            generators = self._noise()
+            for name, state in (noise or {}).items():
+                if name in generators:
+                    generators[name].bit_generator.state = state
+
+    def _noise(self) -> dict[str, np.random.Generator]:
+        """Return the generators of the noise of the devices by name."""
+        found = [(str(getattr(device, "name", "")), getattr(device, "_rng", None)) for device in self._devices]
+        return {name: rng for name, rng in found if isinstance(rng, np.random.Generator)}
 
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""
@@ -319,3 +350,8 @@ def reset() -> None:
         worlds = list(_worlds.values())
     for each in worlds:
         each.end()
+
+
+def _stated(event: Event) -> dict[str, Any]:
+    """Return the fields of an event that it states."""
+    return {name: value for name, value in asdict(event).items() if value is not None}

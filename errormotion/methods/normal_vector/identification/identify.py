@@ -246,13 +246,14 @@ def _sources(estimate: Estimate) -> Array:
 
 
 def _times(cleaned: Cleaned, data: Readings, settings: Settings) -> Array:
-    """Return the time of each cycle: the mean of its touches if these have times and are used, else its start."""
+    """Return the time of each cycle: the mean of its valid touches if these have times, else its start."""
     time = data.seen.cycle_time.copy()
-    if not (settings.interpolate and data.timed):
+    if not data.timed:
         return time
     mean, known = rigid.mean_time(data.seen), data.seen.valid.any(axis=(1, 2))
     time[known] = mean[known]
-    time[cleaned.used] = cleaned.fit.time
+    if settings.interpolate:
+        time[cleaned.used] = cleaned.fit.time
     return time
 
 
