@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.special import stdtrit
 
 from errormotion.arrays import Array
 from errormotion.compensation.thermal_model import training
@@ -24,6 +23,7 @@ from errormotion.compensation.thermal_model.settings import Settings
 from errormotion.datasets import provenance
 from errormotion.errors import DatasetError
 from errormotion.estimation import ridge
+from errormotion.estimation.variance import expansion
 
 LAGS: tuple[tuple[float, ...], ...] = ((), (600.0,), (1800.0,), (600.0, 1800.0))
 TIME_CONSTANTS: tuple[tuple[float, ...], ...] = (
@@ -284,8 +284,7 @@ def _made(
             if np.isfinite(found := ridge.mean_square(residual[group == number], weight[group == number]))
         )
         freedom = max(ridge.effective_count(residual, group), 1.0)
-        # Standard uncertainty with few degrees of freedom, enlarged so that k = 1.96 gives 95 %.
-        misfit[k] = np.sqrt(square) * stdtrit(freedom, 0.975) / stdtrit(np.inf, 0.975)
+        misfit[k] = np.sqrt(square) * expansion(freedom)
         of_scaled = ridge.covariance(X, weight, strength, square, residual, group)
         covariance[k] = of_scaled / np.outer(scale, scale)
         removed[k] = 1 - np.sqrt(ridge.mean_square(residual, weight) / ridge.mean_square(y, weight))

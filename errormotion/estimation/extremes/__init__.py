@@ -83,12 +83,12 @@ def of_noisy_values(
     Parameters
     ----------
     figures : callable
-        From values (..., *shape) to figures (...) or (..., figure).
-    values : ndarray, (*shape,)
+        From values of this shape, with any leading dimensions (...), to figures (...) or (..., figure).
+    values : ndarray, of any shape
         Measured, in any unit.
-    independent : ndarray, (*shape,)
+    independent : ndarray, of the same shape
         Standard uncertainty that is independent from value to value.
-    shared : ndarray, (source, *shape)
+    shared : ndarray, (source, ...)
         Effect of one standard uncertainty of each source that the values share.
     draws : int, optional
         Number of simulations; default: `DRAWS`, fewer for more than 3000 values.

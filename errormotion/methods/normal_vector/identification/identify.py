@@ -14,6 +14,7 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
+from errormotion.estimation.variance import expansion
 from errormotion.methods.normal_vector.identification import normals, rigid
 from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
 from errormotion.methods.normal_vector.identification.moved import Cleaned, clean
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 
 FALSE_ALARM = 1e-3
 """Probability at which touches with the stated noise are reported as noisier."""
-QUANTILE = 0.975
 MIN_SOURCE = 1e-4
 """Smallest variance of a common source, relative to the largest one, that is stated separately."""
 
@@ -150,7 +150,7 @@ def _noise_factor(found: rigid.Rigid, stated: bool, settings: Settings, notes: l
             f"The noise of a touch is not stated; {np.sqrt(variance) * 1e6:.3g} um from the residuals, with "
             f"{found.freedom} degrees of freedom."
         )
-        return float(variance * (special.stdtrit(found.freedom, QUANTILE) / special.ndtri(QUANTILE)) ** 2)
+        return float(variance * expansion(found.freedom) ** 2)
     if found.freedom > 0 and found.chi2 > special.chdtri(found.freedom, FALSE_ALARM):
         ratio = found.chi2 / found.freedom
         raised = settings.noise == "auto"
