@@ -21,9 +21,8 @@ from errormotion.twin import VirtualMachine
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("layout", ["channel first", "time first"])
 @pytest.mark.parametrize("lost", [0.0, 0.02, 1.0])
-@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("block", [64, 1 << 16])
-def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, block, monkeypatch):
+def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, block, monkeypatch):
     monkeypatch.setattr(averaging, "_BLOCK", block)
     rng = np.random.default_rng(0)
     values = rng.normal(1e-3, 1e-6, (5, 3001)).astype(dtype)
@@ -31,7 +30,7 @@ def test_sums_are_those_of_numpy_in_both_layouts(dtype, layout, lost, compiled, 
     if layout == "time first":
         values = np.ascontiguousarray(values.T).T
     edges = np.array([0, 1, 1, 700, 1403, 3001])
-    sums, counts = window_sums(values, edges, compiled=compiled)
+    sums, counts = window_sums(values, edges)
     for k, (a, b) in enumerate(pairwise(edges)):
         part = values[:, a:b].astype(np.float64)
         np.testing.assert_allclose(sums[:, k], np.nansum(part, axis=1), rtol=1e-13)
@@ -128,15 +127,12 @@ def test_slices_take_the_time_from_a_rate_where_there_is_no_variable():
 
 @pytest.mark.parametrize("dims", [("channel", "time"), ("time", "channel")])
 @pytest.mark.parametrize("slice_bytes", [1 << 14, 1 << 17])
-def test_a_record_is_averaged_the_same_by_compiled_sums_in_any_slices_and_by_any_number_of_threads(
-    dims, slice_bytes, monkeypatch
-):
+def test_a_record_is_averaged_the_same_in_any_slices_and_by_any_number_of_threads(dims, slice_bytes, monkeypatch):
     raw = simulation.raw_drift(VirtualMachine("cframe", seed=1), np.arange(0.0, 40.0, 0.002), seed=0)
     raw = raw.assign(distance=raw["distance"].transpose(*dims).copy())
     whole_hash = hash_dataset(raw)
     found = []
-    for compiled_from, cores, size in ((1 << 40, 1, 1 << 30), (1 << 40, 3, slice_bytes), (0, 3, slice_bytes)):
-        monkeypatch.setattr(record, "COMPILED_SIZE", compiled_from)
+    for cores, size in ((1, 1 << 30), (3, slice_bytes)):
         monkeypatch.setattr(record, "cores", lambda cores=cores: cores)
         monkeypatch.setattr(averaging, "_SLICE_BYTES", size)
         with DatasetHasher(raw) as hasher:

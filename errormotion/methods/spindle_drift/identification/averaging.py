@@ -1,8 +1,7 @@
 """Averages of fixed length over records of any length.
 
 A drift record of billions of samples is reduced to one mean every half second. It is read in slices, so that it needs
-constant memory. Numpy adds up what fits into the cache of a core at a time; `averaging_kernels` is twice as fast from
-memory, but takes most of a second to load, which pays off for records of a working day.
+constant memory. Numpy adds up what fits into the cache of a core at a time.
 """
 
 from __future__ import annotations
@@ -34,15 +33,11 @@ _SLICE_BYTES = 32 << 20
 """Size of the slices in which a record is read."""
 _BLOCK = 1 << 17
 """Samples of windows of several lengths that are added up at a time, as numbers of double precision: a megabyte."""
-COMPILED_SIZE = 1 << 32
-"""Values from which on the compiled sums are faster, the time to load them included."""
 _MIN_WINDOW = 0.5
 """Share of the last window below which it is ignored: run-out does not average away in a part of it."""
 
 
-def window_sums(
-    values: NDArray[np.floating[Any]], edges: NDArray[np.int64], threads: int | None = None, *, compiled: bool = False
-) -> tuple[Array, NDArray[np.int64]]:
+def window_sums(values: NDArray[np.floating[Any]], edges: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
     """Return sums and numbers of the values that are not NaN, between consecutive edges.
 
     Parameters
@@ -51,10 +46,6 @@ def window_sums(
         In either memory order; the transposed view of a (sample, channel) array is not copied.
     edges : ndarray, int64, (window + 1,)
         Sample indices, not decreasing.
-    threads : int, optional
-        Number of threads of the compiled sums; default all cores.
-    compiled : bool
-        Use the compiled sums.
 
     Returns
     -------
@@ -62,10 +53,6 @@ def window_sums(
     """
     if values.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
         values = values.astype(np.float64)
-    if compiled:
-        from errormotion.methods.spindle_drift.identification import averaging_kernels
-
-        return averaging_kernels.sums(values, edges, threads)
     samples = np.diff(edges)
     sums, counts = np.empty((len(values), samples.size)), np.empty((len(values), samples.size), np.int64)
     for part in _groups(samples):

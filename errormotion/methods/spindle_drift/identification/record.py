@@ -21,7 +21,6 @@ from errormotion.datasets.files.hashing import DatasetHasher, cores
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.averaging import (
-    COMPILED_SIZE,
     Averager,
     Averages,
     Windows,
@@ -171,9 +170,6 @@ def _pieces(
     raw: xr.Dataset, averagers: Mapping[str, Averager], order: list[int], hasher: DatasetHasher
 ) -> Iterator[_Piece]:
     """Yield a record slice by slice. Each is read, hashed and added up by one thread while it is in its cache."""
-    # Numpy is four times slower where the channels of a sample are neighbours.
-    weight = 1 if raw["distance"].dims[-1] == "time" else 4
-    compiled = weight * raw["distance"].size >= COMPILED_SIZE
 
     def work(time: Times, part: xr.Dataset, done: int, windows: Windows | None) -> _Piece:
         values, sums = {}, {}
@@ -186,7 +182,7 @@ def _pieces(
                 rows = rows[order]
             values[name] = rows
             if windows is not None:
-                total, counts = window_sums(rows, windows.edges, 1, compiled=compiled)
+                total, counts = window_sums(rows, windows.edges)
                 sums[name] = total, counts, missing_places(rows, windows.edges, counts)
         return _Piece(time, windows, values, sums)
 
