@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -9,10 +10,12 @@ import pytest
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Block, Noise
+from errormotion.estimation.checks.candidates import steps
+from errormotion.estimation.checks.exclusions import cleaned
 from errormotion.estimation.fit import fit
 from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places, errors_of
-from errormotion.methods.normal_vector.identification import rigid
+from errormotion.methods.normal_vector.identification import moved, rigid
 from errormotion.methods.normal_vector.identification.identify import fitted
 from errormotion.methods.normal_vector.identification.reading import read
 from errormotion.methods.normal_vector.settings import Settings
@@ -85,3 +88,38 @@ def test_touches_of_balls(tool_axes: Any, interpolate: bool) -> None:
     assert np.abs(ratio - 1).max() < 1e-5
     assert found.chi2 == pytest.approx(expected.chi2, rel=1e-7)
     assert found.freedom == expected.freedom
+
+
+@pytest.mark.parametrize(("shift", "outliers"), [(0.0, 0), (2e-6, 0), (0.0, 2), (5e-6, 1)])
+def test_outliers_and_balls_that_moved_are_those_of_the_method(shift: float, outliers: int) -> None:
+    """A ball shifted from the middle on, and touches wrong by 12 standard deviations of their noise."""
+    settings = Settings(duration=3600.0, robust=False, interpolate=False)
+    raw, _ = simulate(settings, 3)
+    data, motion, _ = fitted(read(raw, settings, []), settings)
+    k, b, m = data.seen.valid.shape
+    rng = np.random.default_rng(outliers)
+    position = data.seen.position.copy()
+    normal = position - data.seen.spheres[0][:, None]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    position[k // 2 :, 2] += shift / np.sqrt(3)
+    for _ in range(outliers):
+        at = (rng.integers(k), rng.integers(b - 1), rng.integers(m))
+        position[at] += 12 * normal[at] / np.sqrt(data.seen.weight[(*at, at[2])])
+    seen = replace(data.seen, position=position)
+    expected = moved.clean(seen, motion, interpolate=False, stated=True, robust=True, smallest_move=1e-7)
+    problem, refresh = model(seen, motion, False)
+    cycle, ball, _ = (each.ravel() for each in np.meshgrid(*(np.arange(s) for s in (k, b, m)), indexing="ij"))
+    search = steps(
+        cycle.astype(float), ball, -normal.reshape(-1, 3), lambda i, t: f"ball {i}, cycle {t:g}", smallest=1e-7
+    )
+    found = cleaned(problem, suspects=search, refresh=refresh, name=lambda at: str(np.unravel_index(at[0], (k, b, m))))
+    moves = [f"ball {each.ball}, cycle {each.cycle}" for each in expected.moves]
+    assert [each.words for each in found.made if each.words.startswith("ball")] == moves
+    wrong = expected.wrong.copy()
+    for each in expected.moves:
+        wrong[each.cycle :, each.ball] = True
+    # besides, touches that explain an outlier nearly as well
+    certain = [each.excluded[:, 0] for each in found.made if not each.rivals or each.words.startswith("ball")]
+    assert found.excluded[:, 0][wrong.ravel()].all()
+    assert not np.any(certain, axis=0)[~wrong.ravel()].any()
+    assert wrong.any() == bool(shift or outliers)

@@ -134,7 +134,7 @@ def cleaned(
     name : callable, optional
         From the index of a number (reading, number), or of a reading (reading,), to its name in messages.
     refresh, what
-        See `fit`.
+        See `fit`. With candidates that add unknowns, ``refresh`` must change the problem that it is given.
 
     Raises
     ------
@@ -209,7 +209,13 @@ class _Search:
         if before is not None:
             more = [block.start for block in problem.unknowns[len(before.problem.unknowns) :]]
             start = Unknown([*before.linear.at.tables, *more], before.linear.at.adjusted)
-        return fit(problem, refresh=self.refresh, what=self.what, start=start)
+        return fit(problem, refresh=None if self.refresh is None else self._refreshed, what=self.what, start=start)
+
+    def _refreshed(self, problem: Problem, x: Any) -> Problem:
+        """Return the refreshed problem; what is excluded stays excluded."""
+        if self.refresh is None:
+            return problem
+        return replace(self.refresh(problem, x), readings=problem.readings)
 
     def searched(self, found: Fit) -> tuple[Fit | None, Flags]:
         """Return the fit after the most improbable exclusions, None if there are none; and what is undecided."""
