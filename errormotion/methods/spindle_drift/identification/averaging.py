@@ -181,7 +181,7 @@ class Averager:
         windows = self.windows(time)
         if windows is None:
             return _samples_as_windows(values_of(time), values)
-        sums, counts = window_sums(values, windows.edges, 1)
+        sums, counts = window_sums(values, windows.edges)
         return self.add(time, windows, sums, counts, missing_places(values, windows.edges, counts))
 
     def windows(self, time: Times) -> Windows | None:
