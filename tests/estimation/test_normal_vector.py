@@ -122,7 +122,7 @@ def test_outliers_and_balls_that_moved_are_those_of_the_method(shift: float, out
     certain = found.excluded[:, 0].copy()
     for each in found.made:
         if each.rivals and not each.words.startswith("ball"):
-            certain &= ~each.excluded[:, 0]
+            certain &= ~each.readings[:, 0]
     assert found.excluded[:, 0][wrong.ravel()].all()
     assert not certain[~wrong.ravel()].any()
     assert wrong.any() == bool(shift or outliers)

@@ -32,7 +32,7 @@ from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown
 
-__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned"]
+__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned", "notes"]
 
 FALSE_ALARM = 1e-3
 """Probability of excluding anything from valid data."""
@@ -44,6 +44,8 @@ CONTRADICTED = 0.01
 Otherwise a noise that is stated too small would make outliers of valid readings.
 """
 MAX_PASSES = 60
+SHOWN = 8
+"""Exclusions that are named in a note."""
 _TOGETHER = 100
 """Largest number of suspicious numbers that are compared with one another in a pass."""
 _SIZE = 2e7
@@ -65,8 +67,8 @@ class Exclusion:
         Probability of such a gain in any of the tests of valid data; 0 if it is below 1e-300.
     size : ndarray, (k,)
         The estimated gross error, in the unit of the residuals, or the unknowns of a candidate.
-    excluded : ndarray of bool, shape of the readings
-        Readings that are not used any more.
+    readings : ndarray of bool, shape of the readings
+        Those that are excluded, or in doubt if it is undecided.
     rivals : tuple of str
         Other explanations that are hardly less probable. They are excluded as well if the remaining readings determine
         all unknowns; if not, nothing is excluded.
@@ -76,7 +78,7 @@ class Exclusion:
     gain: float
     probability: float
     size: Array
-    excluded: Flags
+    readings: Flags
     rivals: tuple[str, ...] = ()
 
 
@@ -105,8 +107,31 @@ class Cleaned:
         """All excluded readings, in the shape of the readings."""
         found = np.zeros(self.fit.problem.readings.shape, dtype=bool)
         for each in self.made:
-            found |= each.excluded
+            found |= each.readings
         return found
+
+
+def notes(found: Cleaned, what: str = "readings") -> list[str]:
+    """Return one sentence on what was excluded, and one on each contradiction that remains; none for valid data."""
+    texts = []
+    if found.made:
+        shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in found.made[:SHOWN]]
+        more = f", and {len(found.made) - SHOWN} more" if len(found.made) > SHOWN else ""
+        count = int(found.excluded.reshape(len(found.excluded), -1).any(axis=1).sum())
+        is_ = "is" if count == 1 else "are"
+        texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {count} of them {is_} not used.")
+    for each in found.undecided:
+        if each.rivals:
+            texts.append(
+                f"One of {', '.join([each.words, *each.rivals])} is wrong, and the other {what} do not show which; "
+                "all are used. Measure them again, or add further ones."
+            )
+        else:
+            texts.append(
+                f"The {what} indicate: {each.words}; they are used, since the others do not determine the result. "
+                "Measure again."
+            )
+    return texts
 
 
 def cleaned(
@@ -262,11 +287,11 @@ class _Search:
                 gain=each.gain,
                 probability=_probability(each.chance, trials),
                 size=each.size,
-                excluded=out,
+                readings=out,
                 rivals=tuple(self.words(at) for at in each.rivals),
             )
             if each.rivals and not self.possible(found, wrong | out):
-                self.undecided.append(replace(one, excluded=np.zeros_like(out)))
+                self.undecided.append(one)
                 open_ |= self.flags(each.at)
             else:
                 self.made.append(one)
@@ -285,7 +310,7 @@ class _Search:
             gain=best.gain,
             probability=_probability(chance, trials),
             size=best.size,
-            excluded=out,
+            readings=out,
             rivals=tuple(each.candidate.words for each in structures[1:] if each.gain > best.gain - RIVAL * unit),
         )
         if candidate.excluded is None:
@@ -296,7 +321,7 @@ class _Search:
         try:
             better = self.fitted(problem, found)
         except FitError:
-            self.undecided.append(replace(one, excluded=np.zeros_like(out)))
+            self.undecided.append(one)
             return found
         self.made.append(one)
         return better

@@ -12,7 +12,7 @@ from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
 from errormotion.estimation.checks.candidates import Candidate, steps
 from errormotion.estimation.checks.effects import Numbers, information
-from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned
+from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, notes
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -186,6 +186,7 @@ def test_a_contradiction_without_a_culprit_is_reported_and_not_excluded() -> Non
     assert not found.made
     assert len(found.undecided) == 1
     assert {found.undecided[0].words, *found.undecided[0].rivals} == {"reading 5", "reading 6"}
+    assert list(np.flatnonzero(found.undecided[0].readings)) == [4, 5]
     assert not found.excluded.any()
 
 
@@ -266,3 +267,47 @@ def test_an_endless_search_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -
     y[5] += 50
     with pytest.raises(FitError, match="more than 1 searches"):
         cleaned(curve(y))
+
+
+class Network(NamedTuple, Generic[T]):
+    target: T
+
+
+@pytest.mark.parametrize("stations", [3, 4, 5])
+def test_the_wrong_distance_of_a_target_is_found_from_five_stations_on(stations: int) -> None:
+    """In a plane: 3 distances contradict, 4 show in most places which one is wrong, 5 do in all."""
+    rng = np.random.default_rng(13)
+    angle = 2 * np.pi * np.arange(stations) / stations
+    station = 3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    target = rng.uniform(-1, 1, (60, 2))
+    t, s = (each.ravel() for each in np.meshgrid(np.arange(60), np.arange(stations), indexing="ij"))
+    y = np.linalg.norm(target[t] - station[s], axis=1) + 1e-3 * rng.standard_normal(t.size)
+    y[17 * stations + 1] += 0.05
+
+    def equation(y: Array, u: Network[Array], c: Any) -> Array:
+        return np.asarray(y - np.linalg.norm(u.target - station[s], axis=1))
+
+    problem = Problem(
+        equation=equation, readings=y, unknowns=Network(Block(start=target, index=t, scale=1.0)),
+        noise=Noise(sd=np.full(t.size, 1e-3)),
+    )  # fmt: skip
+    found = cleaned(problem)
+    wrong = 17 * stations + 1
+    if stations == 3:
+        assert not found.made
+        assert list(np.flatnonzero(found.undecided[0].readings)) == [51, 52, 53]
+    else:
+        assert list(np.flatnonzero(found.excluded)) == [wrong]
+
+
+def test_valid_data_have_no_note_and_others_one_sentence() -> None:
+    y = np.random.default_rng(14).standard_normal(20)
+    assert notes(cleaned(curve(y))) == []
+    y[7] += 20
+    assert notes(cleaned(curve(y)), "distances") == [
+        "Some distances contradict the others (reading 8); 1 of them is not used."
+    ]
+    pair = np.array([[0.0, 0.3], [0.2, -0.1], [0.4, 20.0], [0.1, 0.2]])
+    text = notes(cleaned(levels(4, 2, pair)))
+    assert len(text) == 1
+    assert text[0].startswith("One of reading 5, reading 6 is wrong") or "reading 6, reading 5" in text[0]
