@@ -77,6 +77,11 @@ class Components:
     _columns: tuple[Index, ...]
 
     @property
+    def used(self) -> Array:
+        """Variances of the final fit: at least a negligible one, (k,)."""
+        return np.maximum(self.variance, self._floor)
+
+    @property
     def freedom(self) -> Array:
         """Degrees of freedom of each variance; 0 where it is 0."""
         spread = np.diagonal(self.covariance)
@@ -97,16 +102,21 @@ class Components:
         """
         x, z = self.fit.normal.solve(a, b)
         g = np.einsum("rpk,rpk->k", a, x) + np.einsum("qk,qk->k", b, z)
-        theta = np.maximum(self.variance, self._floor)
-        slope = np.zeros((len(theta), len(g)))
-        for i, (name, at) in enumerate(zip(self.names, self._columns, strict=True)):
-            if name == NOISE:
-                part = np.einsum("nmk,nmk->k", *[self.fit.linear.effect(x, z)] * 2)
-            else:
-                part = np.sum(np.square(z[at]), axis=0) / theta[i]
-            slope[i] = part / theta[i]
-        spread = np.einsum("ik,ij,jk->k", slope, self.covariance, slope)
-        return np.asarray(2 * g**2 / np.maximum(spread, 1e-300))
+        parts = []
+        for name, theta, at in zip(self.names, self.used, self._columns, strict=True):
+            noise = name == NOISE
+            effect = self.fit.linear.effect(x, z).reshape(-1, g.size) if noise else z[at] / np.sqrt(theta)
+            parts.append(np.sum(np.square(effect), axis=0))
+        return self.freedom_of_parts(np.array(parts).reshape(len(self.names), g.size), g)
+
+    def freedom_of_parts(self, parts: Array, variance: Array) -> Array:
+        """Return the degrees of freedom of variances (...), of which ``parts`` (k, ...) are due to each component.
+
+        The part of the noise is that of the readings, those of the others are the squared effects of their sources.
+        """
+        slope = parts / self.used.reshape(-1, *[1] * np.ndim(variance))
+        spread = np.einsum("i...,ij,j...->...", slope, self.covariance, slope)
+        return np.asarray(2 * np.square(variance) / np.maximum(spread, 1e-300 + 1e-9 * np.square(variance)))
 
 
 def components(

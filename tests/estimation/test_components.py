@@ -150,6 +150,31 @@ def test_means_and_their_covariance_are_those_of_the_estimated_covariance() -> N
     assert whole == pytest.approx(np.diag(C), rel=1e-5)
 
 
+def test_the_degrees_of_freedom_follow_from_the_parts_of_a_variance() -> None:
+    """Of the mean: the noise over all readings, and the variance of the offsets over the runs."""
+    found = components(one_way(np.random.default_rng(0).standard_normal((6, 9)) + 2 * np.arange(6)[:, None]))
+    parts = np.array([found.variance[0] / 6, found.variance[1] / 54])
+    its = found.freedom_of(np.ones((1, 1, 1)), np.zeros((found.fit.linear.numbering.size, 1)))
+    assert found.freedom_of_parts(parts, parts.sum()) == pytest.approx(its[0], rel=1e-5)
+    # a part of known variance adds none
+    assert found.freedom_of_parts(parts, 2 * parts.sum()) == pytest.approx(4 * its[0], rel=1e-5)
+
+
+def test_a_problem_without_components_is_fitted_as_it_is() -> None:
+    y = np.random.default_rng(8).standard_normal((4, 5))
+    problem = one_way(y, stated=True)
+    runs = problem.unknowns.run
+    plain = Block(start=runs.start, index=runs.index, scale=1.0, prior=2.0)
+    problem = Problem(
+        equation=problem.equation, readings=problem.readings, noise=problem.noise,
+        unknowns=Runs(problem.unknowns.mean, plain),
+    )  # fmt: skip
+    found = components(problem)
+    assert found.names == ()
+    assert found.fit.chi2 == pytest.approx(fit(problem).chi2)
+    assert found.freedom_of(np.ones((1, 1, 1)), np.zeros((4, 1)))[0] > 1e6
+
+
 def test_missing_readings_and_a_stated_noise() -> None:
     problem, X, Z = positioning(4, 7, 4, sizes=np.array([3e-6, 2e-6, 1e-6, 1e-6]))
     wrong = np.zeros(len(X), dtype=bool)

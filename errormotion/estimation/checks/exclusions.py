@@ -118,8 +118,8 @@ def notes(found: Cleaned, what: str = "readings") -> list[str]:
         shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in found.made[:SHOWN]]
         more = f", and {len(found.made) - SHOWN} more" if len(found.made) > SHOWN else ""
         count = int(found.excluded.reshape(len(found.excluded), -1).any(axis=1).sum())
-        is_ = "is" if count == 1 else "are"
-        texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {count} of them {is_} not used.")
+        done = f"{count} of them {'is' if count == 1 else 'are'} not used" if count else "their effect is estimated"
+        texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {done}.")
     for each in found.undecided:
         if each.rivals:
             texts.append(

@@ -222,6 +222,7 @@ def test_a_ball_that_moved_is_found_with_its_cycle(exclude: bool) -> None:
     found = moved(y, exclude=exclude)
     assert sorted(names(found)) == ["ball 3 before cycle 38", "reading 60"]
     assert found.made[0].size[0] == pytest.approx(6, abs=1.5)
+    assert notes(found)[0].endswith("not used.")
     if exclude:
         assert found.excluded.sum() == 60 - 37 + 1
     else:
@@ -306,6 +307,11 @@ def test_valid_data_have_no_note_and_others_one_sentence() -> None:
     y[7] += 20
     assert notes(cleaned(curve(y)), "distances") == [
         "Some distances contradict the others (reading 8); 1 of them is not used."
+    ]
+    steady = np.random.default_rng(15).standard_normal((20, 4))
+    steady[9:, 1] += 8
+    assert notes(moved(steady, exclude=False)) == [
+        "Some readings contradict the others (ball 2 before cycle 10); their effect is estimated."
     ]
     pair = np.array([[0.0, 0.3], [0.2, -0.1], [0.4, 20.0], [0.1, 0.2]])
     text = notes(cleaned(levels(4, 2, pair)))
