@@ -25,8 +25,10 @@ from errormotion.estimation.sources import Errors, Source
 
 __all__ = ["Datum", "Relative", "relative"]
 
-EXACT = 64
+EXACT = 256
 """Largest number of values with a weight that become sources of their own."""
+ROUNDING = 1e-12
+"""Remainder of an effect, relative to it, that is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,7 @@ class Relative:
     covariance : ndarray, (g, g)
         Of the coefficients.
     influence : ndarray, (source, g)
-        Effect of each source of the errors before on the coefficients; their covariance contains it.
+        Effect of each source of the errors on the coefficients.
     """
 
     errors: Errors
@@ -90,40 +92,49 @@ def relative(errors: Errors, datum: Datum) -> Relative:
     F = np.nan_to_num(errors.influence)
     of_h = np.einsum("pgd,spd->sg", H, F)
     moved = [
-        replace(source, effect=source.effect - np.einsum("pdg,g->pd", A, change))
+        replace(source, effect=_difference(source.effect, np.einsum("pdg,g->pd", A, change)))
         for source, change in zip(errors.sources, of_h, strict=True)
     ]
     own = np.nan_to_num(errors.own)
     HDH = np.einsum("pgi,pij,phj->gh", H, own, H, optimize=True)
     weighted = np.flatnonzero((w > 0).any(axis=1) & own.any(axis=(1, 2)))
     if weighted.size * own.shape[1] <= EXACT:
-        rest, added = _exact(own, A, H, weighted, datum.group)
+        rest, added, more = _exact(own, A, H, weighted, datum.group)
     else:
-        rest, added = _common(own, A, H, HDH, datum.group)
+        rest, added, more = _common(own, A, H, HDH, datum.group)
     found = Errors(np.where(known, value - np.einsum("pdg,g->pd", A, h), np.nan), rest, [*moved, *added])
-    return Relative(found, h, HDH + of_h.T @ of_h, of_h)
+    return Relative(found, h, HDH + of_h.T @ of_h, np.concatenate([of_h, more]))
 
 
-def _exact(own: Array, A: Array, H: Array, weighted: Index, group: str) -> tuple[Array, list[Source]]:
-    """Return the independent part without the places that define the datum, each of which is a source."""
-    rest, added = own.copy(), list[Source]()
+def _exact(own: Array, A: Array, H: Array, weighted: Index, group: str) -> tuple[Array, list[Source], Array]:
+    """Return the independent part without the places that define the datum, and these as sources with their effect."""
+    rest, added, of_h = own.copy(), list[Source](), list[Array]()
     for place in weighted:
         root = _root(own[place])
         for k in range(root.shape[1]):
-            effect = -np.einsum("pdg,gi,i->pd", A, H[place], root[:, k])
+            change = H[place] @ root[:, k]
+            effect = -np.einsum("pdg,g->pd", A, change)
             effect[place] += root[:, k]
             if np.abs(effect).max() > 1e-9 * np.abs(root).max():
                 added.append(Source(f"{group} {len(added) + 1}", group, effect))
+                of_h.append(change)
         rest[place] = 0.0
-    return rest, added
+    return rest, added, np.array(of_h).reshape(-1, A.shape[2])
 
 
-def _common(own: Array, A: Array, H: Array, HDH: Array, group: str) -> tuple[Array, list[Source]]:
-    """Return the independent part with its cross terms, and the common effect of the datum."""
+def _common(own: Array, A: Array, H: Array, HDH: Array, group: str) -> tuple[Array, list[Source], Array]:
+    """Return the independent part with its cross terms, and the common effect of the datum on errors and on h."""
     cross = own @ np.swapaxes(H, 1, 2) @ np.swapaxes(A, 1, 2)
     root = _root(HDH)
     added = [Source(f"{group} {k + 1}", group, -np.einsum("pdg,g->pd", A, root[:, k])) for k in range(root.shape[1])]
-    return own - cross - np.swapaxes(cross, 1, 2), added
+    return own - cross - np.swapaxes(cross, 1, 2), added, root.T
+
+
+def _difference(effect: Array, removed: Array) -> Array:
+    """Return the effect of a source without the part of the datum; exactly 0 where nothing but rounding remains."""
+    left = effect - removed
+    rounding = ROUNDING * np.nanmax(np.abs(effect), axis=0, initial=0.0)
+    return np.asarray(np.where(np.abs(left) <= rounding, 0.0, left))
 
 
 def _root(C: Array) -> Array:

@@ -250,7 +250,7 @@ def _root(S: Array, D: Array, gauge: Array | None) -> Array:
         Z = full[:, gauge.shape[1] :]
     inner = Z.T @ scaled @ Z
     power, vectors = np.linalg.eigh((inner + inner.T) / 2)
-    if power[0] <= SINGULAR * max(power[-1], 1.0):
+    if power.size and power[0] <= SINGULAR * max(power[-1], 1.0):
         lost = Z @ vectors[:, power <= SINGULAR * max(power[-1], 1.0)]
         columns = np.flatnonzero(np.abs(lost).max(axis=1) > 0.1 * np.abs(lost).max())
         raise SingularError(np.zeros(0, dtype=int), columns)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,22 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
+from errormotion.estimation.checks.exclusions import Exclusion, cleaned
+from errormotion.estimation.components import noise_variance
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import Scatter, expansion, variance_factor
 from errormotion.kinematics.iso import DOF
 from errormotion.measurement.observed import Model, Observed
 from errormotion.plugins import MethodInfo
 
-__all__ = ["Solved", "dataset", "identify", "solve"]
+__all__ = ["Solved", "dataset", "estimated_noise", "identify", "solve"]
+
+_STEPS = 10
+_SAME = 1e-6
+"""Relative change of the variance of the noise that ends its estimation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +42,7 @@ class Solved:
 
 
 def solve(observed: Observed) -> Solved:
-    """Return the solution of a problem.
+    """Return the solution of a problem; its ``observed`` is without outliers, and without suspects.
 
     Raises
     ------
@@ -42,25 +50,97 @@ def solve(observed: Observed) -> Solved:
         The readings do not determine the unknowns, or neither noise nor redundancy is there.
     """
     try:
-        found = fit(observed.problem, refresh=observed.refresh, what=observed.what)
+        observed, found = _cleaned(observed)
+        problem = observed.problem
+        priors = _has_priors(problem)
+        estimated: list[Fit] = []
+
+        def estimate() -> tuple[float, float]:
+            at, factor, freedom = estimated_noise(found, refresh=observed.refresh, what=observed.what)
+            estimated.append(at)
+            return factor, freedom
+
         scatter = variance_factor(
             found.chi2,
             found.freedom,
-            stated=observed.problem.noise.stated,
+            stated=problem.noise.stated,
             increase=observed.noise_increases,
+            priors=priors,
+            estimate=estimate if priors else None,
             what=observed.what,
             cause=observed.noise_cause,
         )
+        if estimated and scatter.factor == 1.0 and problem.noise.stated:
+            estimated.clear()  # not larger than stated
         # An estimated variance has a Student distribution (GUM, G.3.2).
-        factor = scatter.factor * float(expansion(scatter.freedom)) ** 2
-        return Solved(
-            observed,
-            found,
-            scatter,
-            related(observed, errors_of(found, observed.places, factor=factor, shared=observed.shared)),
-        )
+        factor = (1.0 if estimated else scatter.factor) * float(expansion(scatter.freedom)) ** 2
+        final = estimated[0] if estimated else found
+        errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
+        return Solved(observed, final, scatter, related(observed, errors))
     except FitError as error:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
+
+
+def _cleaned(observed: Observed) -> tuple[Observed, Fit]:
+    """Return what was observed without outliers, with a note on each, and the fit."""
+    if observed.suspects is None:
+        return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what)
+    problem, what = observed.problem, observed.what
+    if not problem.noise.stated and _has_priors(problem):
+        # Else a unit of noise would hide what the readings say about the constants.
+        problem = estimated_noise(fit(problem, refresh=observed.refresh, what=what), what=what)[0].problem
+    found = cleaned(problem, suspects=observed.suspects, name=observed.name, refresh=observed.refresh, what=what)
+    sentences = [_sentence(each) for each in found.made]
+    sentences += [
+        f"The readings contradict one another ({' or '.join([each.words, *each.rivals])}); nothing is excluded."
+        for each in found.undecided
+    ]
+    notes = [*observed.notes, *sentences]
+    return replace(observed, problem=found.fit.problem, suspects=None, notes=notes), found.fit
+
+
+def _has_priors(problem: Problem) -> bool:
+    """Return whether the sum of squares contains priors."""
+    return bool(problem.adjusted) or any((block.information[block.freed] > 0).any() for block in problem.unknowns)
+
+
+def _sentence(found: Exclusion) -> str:
+    """Return the note on an outlier or a structural change."""
+    what, count = found.words[:1].upper() + found.words[1:], int(found.excluded.sum())
+    if count == 1:
+        what += " is excluded as an outlier"
+    else:
+        what += f"; {count} readings are excluded" if count else "; this is estimated and corrected"
+    others = f" Equally probable: {', '.join(found.rivals)}." if found.rivals else ""
+    return f"{what} (probability in valid data: {max(found.probability, 1e-99):.1g}).{others}"
+
+
+def estimated_noise(
+    found: Fit, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
+) -> tuple[Fit, float, float]:
+    """Return the fit with the noise of its readings by restricted likelihood, its variance factor and freedom.
+
+    Priors keep their standard deviations. The fit is repeated with the noise found, since the estimate is that of the
+    problem as linearised at the fit.
+
+    Raises
+    ------
+    FitError
+        The readings have no redundancy.
+    """
+    problem, noise, size = found.problem, found.problem.noise, 1.0
+    for _ in range(_STEPS):
+        factor, freedom = noise_variance(found)
+        if not factor > 0:
+            break
+        size *= float(np.sqrt(factor))
+        sd = None if noise.sd is None else np.asarray(noise.sd * size)
+        root = None if noise.root is None else np.asarray(noise.root * size)
+        scaled = replace(problem, noise=replace(noise, sd=sd, root=root))
+        found = fit(scaled, refresh=refresh, what=what, start=found.linear.at)
+        if abs(factor - 1) < _SAME:
+            break
+    return found, size**2, freedom
 
 
 def related(observed: Observed, errors: Errors) -> Relative:
@@ -93,7 +173,10 @@ def dataset(
     value = np.where(np.isfinite(errors.value), 0.0, np.nan) if planned else errors.value
     names = _unique([source.name for source in errors.sources])
     notes = [*observed.notes, solved.scatter.note] if not planned else [*observed.notes]
-    extras = dict(observed.extras) | dict(model.results(observed, solved.fit, solved.relative))
+    datum = solved.relative
+    if planned:
+        datum = replace(datum, coefficient=np.zeros_like(datum.coefficient))
+    extras = dict(observed.extras) | dict(model.results(observed, solved.fit, datum))
     return build_errors(
         _placed(value, observed, shape),
         _square(errors.covariance, observed, shape),

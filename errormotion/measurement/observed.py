@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -11,6 +11,8 @@ from errormotion.kinematics.iso import DOF
 if TYPE_CHECKING:
     import xarray as xr
 
+    from errormotion.estimation.blocks import Index
+    from errormotion.estimation.checks.candidates import Candidate
     from errormotion.estimation.datum import Datum, Relative
     from errormotion.estimation.fit import Fit
     from errormotion.estimation.problem import Problem
@@ -54,6 +56,11 @@ class Observed:
         Whether the uncertainties follow the residuals if these scatter more than stated.
     refresh : callable, optional
         See `errormotion.estimation.fit.fit`.
+    suspects : callable, optional
+        From a fit to what may have happened besides single outliers (`errormotion.estimation.checks.candidates`). With
+        it, outliers and what is found are excluded or estimated, each with a note.
+    name : callable, optional
+        From the index of a reading to its name in these notes: "sphere 2 at 30 deg, sensor 1".
     extras : mapping of str to DataArray
         Further variables of the result that follow from the raw data.
     attributes : mapping
@@ -78,6 +85,8 @@ class Observed:
     noise_cause: str = ""
     noise_increases: bool = True
     refresh: Callable[[Problem, Any], Problem] | None = None
+    suspects: Callable[[Fit], Iterable[Candidate]] | None = None
+    name: Callable[[Index], str] | None = None
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()

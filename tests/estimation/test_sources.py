@@ -185,6 +185,38 @@ def test_a_datum_of_many_places_has_exact_totals() -> None:
     H = np.linalg.pinv(A)
     assert result.coefficient == pytest.approx(H @ before.value[:, 0])
     assert result.covariance == pytest.approx(H @ whole(before) @ H.T, rel=1e-9)
+    assert result.influence.shape == (len(result.errors.sources), 2)
+    assert result.influence.T @ result.influence == pytest.approx(result.covariance, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [20, 400])
+def test_the_coefficients_of_a_datum_share_the_sources_of_the_errors(n: int) -> None:
+    """Covariance of errors and coefficients: that of the sources, exactly where the places are sources of their own."""
+    rng = np.random.default_rng(11)
+    own = np.square(rng.uniform(0.5, 2.0, n))[:, None, None]
+    scale = rng.standard_normal((n, 1))
+    before = Errors(rng.standard_normal((n, 1)), own, [Source("scale", "scale", scale)])
+    A = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)
+    result = relative(before, Datum(A[:, None, :], np.ones((n, 1)), "line"))
+    H = np.linalg.pinv(A)
+    assert result.influence.T @ result.influence == pytest.approx(result.covariance, rel=1e-9)
+    cross = np.einsum("spd,sg->pg", result.errors.influence, result.influence)
+    exact = (np.eye(n) - A @ H) @ whole(before) @ H.T
+    if n == 20:
+        assert cross == pytest.approx(exact, abs=1e-12)
+        M = np.eye(n) - A @ H
+        assert whole(result.errors) == pytest.approx(M @ whole(before) @ M.T, abs=1e-12)
+
+
+def test_a_source_that_the_datum_removes_has_no_effect() -> None:
+    n = 30
+    A = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)
+    offset = Source("offset", "offset", (A @ [0.3, -0.7])[:, None])
+    result = relative(
+        Errors(np.zeros((n, 1)), np.ones((n, 1, 1)), [offset]), Datum(A[:, None, :], np.ones((n, 1)), "l")
+    )
+    assert (result.errors.sources[0].effect == 0).all()
+    assert result.influence[0] == pytest.approx([0.3, -0.7])
 
 
 def test_an_unknown_value_defines_no_datum() -> None:

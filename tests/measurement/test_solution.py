@@ -1,0 +1,131 @@
+"""Solution of a model: noise as an unknown beside priors, and outliers with suspects."""
+
+from dataclasses import replace
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.checks.candidates import steps
+from errormotion.estimation.fit import fit
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.sources import Places
+from errormotion.measurement import Observed
+from errormotion.measurement.identification import estimated_noise, solve
+
+T = TypeVar("T")
+N = 40
+POSITION = np.linspace(0.0, 1.0, N)
+SLOPE = 3e-6
+"""Standard uncertainty of the slope, which the readings improve."""
+
+
+class Unknowns(NamedTuple, Generic[T]):
+    level: T
+
+
+class Known(NamedTuple, Generic[T]):
+    slope: T
+
+
+def problem(y: Array, noise: float | None) -> Problem:
+    """Return readings of a level, with a slope that has a prior."""
+    zero = np.zeros(N, dtype=int)
+    return Problem(
+        equation=lambda y, x, c: y - x.level[:, 0] - c.slope[:, 0] * POSITION,
+        readings=y,
+        unknowns=Unknowns(Block(start=np.zeros((1, 1)), index=zero, scale=1.0, group="level")),
+        constants=Known(
+            Constant(value=np.zeros((1, 1)), factor=np.full((1, 1, 1), SLOPE), index=zero, scale=1.0, group="slope",
+                     adjust=True)
+        ),
+        noise=Noise(sd=np.full(N, noise or 1.0), stated=noise is not None),
+    )  # fmt: skip
+
+
+def observed(y: Array, noise: float | None) -> Observed:
+    return Observed(
+        problem=problem(y, noise),
+        places=Places(lambda x, _: x.level, 1),
+        freedoms=("EX",),
+        dims=(),
+        coords={},
+        component="tool",
+        functional_point=(0, 0, 0),
+        reference="none",
+    )
+
+
+def readings(seed: int, noise: float = 0.5e-6) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.asarray(rng.normal(0, SLOPE) * POSITION + rng.normal(0, noise, N))
+
+
+def restricted(y: Array, noise: float) -> float:
+    """Return -2 log of the restricted likelihood, from the dense covariance of the readings."""
+    V = noise**2 * np.eye(N) + SLOPE**2 * np.outer(POSITION, POSITION)
+    W, X = np.linalg.inv(V), np.ones((N, 1))
+    P = W - W @ X @ np.linalg.inv(X.T @ W @ X) @ X.T @ W
+    return float(np.linalg.slogdet(V)[1] + np.linalg.slogdet(X.T @ W @ X)[1] + y @ P @ y)
+
+
+@pytest.mark.parametrize("start", [None, 5e-6, 0.02e-6])
+def test_the_noise_beside_a_prior_maximises_the_restricted_likelihood(start: float | None) -> None:
+    y = readings(1)
+    _, factor, freedom = estimated_noise(fit(problem(y, start)))
+    best = minimize_scalar(lambda s: restricted(y, np.exp(s)), bounds=(np.log(1e-8), np.log(1e-4)), method="bounded",
+                           options={"xatol": 1e-10})  # fmt: skip
+    assert np.sqrt(factor) * (start or 1.0) == pytest.approx(np.exp(best.x), rel=1e-5)
+    assert N - 2 < freedom < N - 1
+
+
+def test_an_increased_noise_does_not_increase_the_uncertainty_of_a_prior() -> None:
+    """The noise is three times the stated one; the slope, whose uncertainty is much larger, keeps its own."""
+    y = readings(2, noise=1.5e-6)
+    solved = solve(observed(y, 0.5e-6))
+    assert solved.scatter.ratio > 2
+    assert "scatter" in solved.scatter.note
+    v = (0.5e-6) ** 2 * solved.scatter.factor
+    V = v * np.eye(N) + SLOPE**2 * np.outer(POSITION, POSITION)
+    X = np.ones((N, 1))
+    student = 1.03  # of some 38 degrees of freedom
+    u = float(np.sqrt(solved.relative.errors.covariance[0, 0, 0]))
+    expected = float(np.sqrt(np.linalg.inv(X.T @ np.linalg.inv(V) @ X)[0, 0]))
+    assert expected <= u <= student * expected * 1.01
+    slope = [source for source in solved.relative.errors.sources if source.group == "slope"]
+    assert slope or solved.relative.errors.own.any()
+
+
+def test_intervals_with_an_unknown_noise_are_covered() -> None:
+    inside = 0
+    for seed in range(300):
+        solved = solve(observed(readings(seed), None))
+        u = np.sqrt(solved.relative.errors.covariance[0, 0, 0])
+        inside += abs(solved.relative.errors.value[0, 0]) <= 1.96 * u
+    assert abs(inside / 300 - 0.95) < 3.3 * np.sqrt(0.95 * 0.05 / 300)
+
+
+def test_an_outlier_and_a_step_are_named_and_repaired() -> None:
+    y = readings(3)
+    y[7] += 20e-6
+    y[25:] += 8e-6
+    find = steps(np.arange(N, dtype=float), np.zeros(N, dtype=int), -np.ones((N, 1)),
+                 lambda _, cut: f"the level has changed at {cut:.0f}", exclude=False)  # fmt: skip
+    one = replace(observed(y, 0.5e-6), suspects=find, name=lambda at: f"reading {at[0] + 1}")
+    solved = solve(one)
+    notes = " ".join(solved.observed.notes)
+    assert "Reading 8 is excluded as an outlier" in notes
+    assert "The level has changed at 25; this is estimated and corrected" in notes
+    assert abs(solved.relative.errors.value[0, 0]) < 4 * np.sqrt(solved.relative.errors.covariance[0, 0, 0])
+    assert solved.observed.suspects is None
+
+
+def test_an_unknown_noise_without_redundancy_is_refused() -> None:
+    y = np.full(N, np.nan)
+    y[3] = 1e-6
+    with pytest.raises(MethodError, match="no redundancy"):
+        solve(observed(y, None))
