@@ -70,7 +70,8 @@ def bound(behaviour: Behaviour, P: np.ndarray) -> np.ndarray:
     runs, lever = SETTINGS.runs, P - P[0]
     of_runs = (behaviour.noise**2 / 2.0 + behaviour.offset**2 + (behaviour.slope * z) ** 2) / runs
     budget = SETTINGS.uncertainty
-    relative = budget.length**2 + budget.alignment**4 + (0.6e-6 * 2.0) ** 2 + (11.5e-6 * budget.temperature) ** 2
+    of_instrument = budget.length_or_assumed**2 + budget.alignment_or_assumed**4
+    relative = of_instrument + (0.6e-6 * 2.0) ** 2 + (11.5e-6 * budget.temperature) ** 2
     return of_runs + relative * lever**2
 
 
