@@ -25,7 +25,8 @@ gc.disable()  # while tests are collected: nothing of that is garbage
 for _library in ("OPENBLAS", "OMP", "MKL"):  # before anything imports numpy
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-PACKAGE = Path(__file__).parents[1] / "errormotion"
+CONFTEST = Path(__file__)
+PACKAGE = CONFTEST.parents[1] / "errormotion"
 IN_CI = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 
@@ -141,8 +142,30 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
     return _ByFile(config, log)
 
 
+def _may_be_slow(file: Path, root: Path) -> bool:
+    """Return whether a file of tests, or a conftest.py that names it, marks slow tests."""
+    above = [folder / "conftest.py" for folder in file.parents if root in folder.parents and folder != CONFTEST.parent]
+    texts = [each.read_text(encoding="utf-8") for each in above if each.exists()]
+    own = file.read_text(encoding="utf-8")
+    return any("mark.slow" in text for text in (own, *(text for text in texts if file.stem in text)))
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``--beyond``, leave out files without such tests: each worker would take seconds to import them."""
+    if not (file := config.getoption("--beyond")) or collection_path.suffix != ".py":
+        return None
+    named = {name.partition("::")[0] for name in _listed(file)}
+    where = collection_path.relative_to(config.rootpath).as_posix()
+    return None if where in named or _may_be_slow(collection_path, config.rootpath) else True
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the longest of the files that wait, and with slow tests: no worker has a long file at the end."""
+    for path in {item.path for item in items if item.get_closest_marker("slow")}:
+        if not _may_be_slow(path, config.rootpath):
+            raise pytest.UsageError(
+                f"{path}: expected 'mark.slow' there, or in a conftest.py that names it; '--beyond' looks there"
+            )
     if file := config.getoption("--beyond"):
         listed = _listed(file)
         beyond = [bool(item.get_closest_marker("slow") or _entry(item.nodeid, listed)) for item in items]

@@ -12,6 +12,8 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration
 from errormotion.report.document import estimate
 
+pytestmark = pytest.mark.slow  # all use one run of the campaign
+
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[RunFolder]]:
@@ -27,7 +29,6 @@ def short_campaign(measured: tuple[Path, list[RunFolder]], monkeypatch: pytest.M
     monkeypatch.setattr(demonstration, "work", lambda *_, **__: folders)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("short_campaign")
 def test_the_demo_prints_results_and_true_values(run: Callable[..., Result], tmp_path: Path) -> None:
     found = json.loads(run("demo", "--json").stdout)
@@ -48,7 +49,6 @@ def test_the_demo_prints_results_and_true_values(run: Callable[..., Result], tmp
     assert found_beams < numbers["nominal beams: directions off by (rms)"]["measured"]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("short_campaign")
 def test_the_table_and_the_report_state_the_same_step(run: Callable[..., Result], tmp_path: Path) -> None:
     found = json.loads(run("demo", "--json").stdout)

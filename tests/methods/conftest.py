@@ -1,9 +1,9 @@
-"""The statistical checks of the kit take many seeds: they are slow tests. Reports without figures."""
+"""The statistical checks of the kit, which share the results of many seeds, are slow tests. Reports without figures."""
 
 import pytest
 from markupsafe import Markup
 
-STATISTICAL = ("test_coverage", "test_differences", "test_sources_as_stated")
+STATISTICAL = ("test_coverage", "test_differences", "test_figures", "test_sources_as_stated")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

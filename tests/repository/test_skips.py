@@ -88,7 +88,20 @@ def test_beyond_the_list_only_slow_tests_run(suite: pytest.Pytester, monkeypatch
         test_listed="def test_one(): pass\ndef test_two(): pass",
         test_mixed="import pytest\n@pytest.mark.slow\ndef test_slow(): pass\n"
         "def test_named(): pass\ndef test_left(): 1 / 0",
+        test_neither="raise RuntimeError('imported')",
     )
     listed = _listed(suite, ("test_listed.py", "a module"), ("test_mixed.py::test_named", "a test"))
-    result = suite.runpytest(*WITHOUT, "--beyond", listed, "test_listed.py", "test_mixed.py")
+    result = suite.runpytest(*WITHOUT, "--beyond", listed, "-k", "listed or mixed or neither")
     result.assert_outcomes(passed=4, deselected=1)
+
+
+def test_slow_tests_are_marked_where_beyond_looks(suite: pytest.Pytester) -> None:
+    suite.makeini("[pytest]\nmarkers = slow")
+    suite.makepyfile(test_ours="def test_one(): pass")
+    folder = suite.mkpydir("marked")
+    (folder / "test_theirs.py").write_text("def test_two(): pass")
+    mark = "import pytest\ndef pytest_collection_modifyitems(items):\n    for item in items: item.add_marker('slow')\n"
+    (folder / "conftest.py").write_text(mark)
+    result = suite.runpytest(*WITHOUT, "marked")
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["*test_theirs.py: expected 'mark.slow' there*"])

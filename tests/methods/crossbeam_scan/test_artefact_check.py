@@ -91,7 +91,6 @@ def clean(raw):
     return {strain: identify(raw, strain=strain) for strain in ("free", "guided")}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("strain", ["free", "guided"])
 def test_no_artefact_is_reported_if_none_moved(strain, clean):
     ds = clean[strain]
@@ -101,7 +100,6 @@ def test_no_artefact_is_reported_if_none_moved(strain, clean):
     assert not named(ds, "cold scan and its repetition")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("artefact", "since", "step"),
     [

@@ -51,7 +51,6 @@ def errors_of(run):
     return datasets.load(path)
 
 
-@pytest.mark.slow
 def test_the_pose_is_that_of_the_virtual_machine(runs):
     ds = errors_of(runs["pose"])
     true = VirtualMachine("gantry", seed=3).crossbeam.pose

@@ -114,7 +114,6 @@ def nees(ds, machine):
 # ---------------------------------------------------------------- truth
 
 
-@pytest.mark.slow
 def test_truth_lies_within_the_stated_uncertainty(found, machines):
     """All values of a campaign at once, with what they share: pose, lever, cold scans."""
     total = 0.0

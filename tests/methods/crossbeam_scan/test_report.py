@@ -236,7 +236,6 @@ def table(html, caption):
     return [[words_of(cell) for cell in re.findall(r"<t[hd].*?</t[hd]>", row, flags=re.DOTALL)] for row in rows]
 
 
-@pytest.mark.slow
 def test_the_chapter_has_its_sections(html):
     for name in ("summary", "errors", "registration", "setup", "stability", "uncertainty", "quality", "provenance"):
         assert f'id="{name}-1"' in html
