@@ -87,17 +87,18 @@ class Numbers:
         self.tested = np.asarray(self.redundancy > MIN_REDUNDANCY)
         self.gain = np.where(self.tested, u**2 / np.where(self.tested, N, 1.0), 0.0)
 
-    def columns(self, where: Sequence[At]) -> Array:
-        """Return the whitened derivatives by these numbers, (n, m, k each)."""
-        n, m = self.W.shape[:2]
-        found = np.zeros((n, m, len(where) * self.k))
-        for j, at in enumerate(where):
-            i = at[0]
+    def columns(self, where: Sequence[At]) -> tuple[Array, Index]:
+        """Return the whitened derivatives by these numbers, (rows, m, k each), and the readings that are the rows."""
+        rows = np.unique(np.array([i for i, _ in where], dtype=np.intp))
+        m = self.W.shape[1]
+        found = np.zeros((rows.size, m, len(where) * self.k))
+        for j, (i, number) in enumerate(where):
+            row = int(np.searchsorted(rows, i))
             if self.whole:
-                found[i, :, j * self.k : (j + 1) * self.k] = np.eye(m)
+                found[row, :, j * self.k : (j + 1) * self.k] = np.eye(m)
             else:
-                found[i, :, j] = self.W[i, :, at[1]]
-        return found
+                found[row, :, j] = self.W[i, :, number]
+        return found, rows
 
     def root(self, at: At) -> Array:
         """Return the inverse of the whitener of a reading, (m, m); 0 for missing numbers."""

@@ -49,7 +49,7 @@ SHOWN = 8
 _TOGETHER = 100
 """Largest number of suspicious numbers that are compared with one another in a pass."""
 _SIZE = 2e7
-"""Largest size of their array."""
+"""Largest size of the array of their effects on the unknowns."""
 
 Flags = NDArray[np.bool_]
 
@@ -396,11 +396,11 @@ class _Sequence:
         consistent = stated and chdtrc(fit.freedom, fit.chi2) > CONTRADICTED
         if not gain.size or (consistent and self.noise.chance(float(gain.max()), self.k) >= limit):
             return
-        n, m = numbers.W.shape[:2]
-        several = int(min(_TOGETHER, max(_SIZE / (n * m * self.k), 1)))
+        unknowns = sum(block.start.size for block in fit.problem.unknowns)
+        several = int(min(_TOGETHER, max(_SIZE / (unknowns * self.k), 1)))
         order = np.argsort(gain, axis=None)[::-1][:several]
         self.where = [(int(o) // gain.shape[1], int(o) % gain.shape[1]) for o in order if gain.flat[o] > 0]
-        self.u, self.N = reduced(fit, numbers.columns(self.where))
+        self.u, self.N = reduced(fit, *numbers.columns(self.where))
         self.floor = MIN_REDUNDANCY * np.array([numbers.weight(at) for at in self.where])
         self.order = self._followed(min(len(self.where), max(fit.freedom // (4 * self.k), 1)))
         if stated:
