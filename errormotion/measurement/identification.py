@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,10 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
-from errormotion.estimation.checks.exclusions import Exclusion, cleaned
+from errormotion.estimation.checks.candidates import Candidate
+from errormotion.estimation.checks.effects import information, solved
+from errormotion.estimation.checks.exclusions import cleaned
+from errormotion.estimation.checks.exclusions import notes as exclusion_notes
 from errormotion.estimation.components import noise_variance
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
@@ -86,33 +89,47 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit]:
     if observed.suspects is None:
         return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what)
     problem, what = observed.problem, observed.what
+    first = fit(problem, refresh=observed.refresh, what=what)
     if not problem.noise.stated and _has_priors(problem):
         # Else a unit of noise would hide what the readings say about the constants.
-        problem = estimated_noise(fit(problem, refresh=observed.refresh, what=what), what=what)[0].problem
-    found = cleaned(problem, suspects=observed.suspects, name=observed.name, refresh=observed.refresh, what=what)
-    sentences = [_sentence(each) for each in found.made]
-    sentences += [
-        f"The readings contradict one another ({' or '.join([each.words, *each.rivals])}); nothing is excluded."
-        for each in found.undecided
-    ]
-    notes = [*observed.notes, *sentences]
-    return replace(observed, problem=found.fit.problem, suspects=None, notes=notes), found.fit
+        first = estimated_noise(first, refresh=observed.refresh, what=what)[0]
+    try:
+        found = cleaned(
+            first.problem, suspects=observed.suspects, name=observed.name, refresh=observed.refresh, what=what
+        )
+        words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
+    except FitError as error:
+        # The readings as such determine the unknowns: too many of them would have to be excluded.
+        raise _contradiction(what, [_likeliest(first, observed.suspects(first))]) from error
+    if words and observed.refuses_contradictions:
+        raise _contradiction(what, words)
+    sentences = [*observed.notes, *exclusion_notes(found, what.removeprefix("the "))]
+    return replace(observed, problem=found.fit.problem, suspects=None, notes=sentences), found.fit
+
+
+def _contradiction(what: str, words: list[str]) -> MethodError:
+    return MethodError(
+        f"{what[:1].upper()}{what[1:]} contradict one another ({'; '.join(filter(None, words)) or 'no likely cause'}), "
+        "and without what is wrong they do not determine the result. Correct the cause and measure again, or remove "
+        "what is wrong."
+    )
+
+
+def _likeliest(found: Fit, suspects: Iterable[Candidate]) -> str:
+    """Return the words of the candidate that decreases the sum of squares most."""
+    best, words = 0.0, ""
+    for each in suspects:
+        design = each.design if each.design.ndim == 3 else each.design[:, None, :]
+        u, N = information(found, design)
+        gain = float(np.ravel(solved(u[None], N[None])[1])[0])
+        if gain > best:
+            best, words = gain, each.words
+    return words
 
 
 def _has_priors(problem: Problem) -> bool:
     """Return whether the sum of squares contains priors."""
     return bool(problem.adjusted) or any((block.information[block.freed] > 0).any() for block in problem.unknowns)
-
-
-def _sentence(found: Exclusion) -> str:
-    """Return the note on an outlier or a structural change."""
-    what, count = found.words[:1].upper() + found.words[1:], int(found.excluded.sum())
-    if count == 1:
-        what += " is excluded as an outlier"
-    else:
-        what += f"; {count} readings are excluded" if count else "; this is estimated and corrected"
-    others = f" Equally probable: {', '.join(found.rivals)}." if found.rivals else ""
-    return f"{what} (probability in valid data: {max(found.probability, 1e-99):.1g}).{others}"
 
 
 def estimated_noise(

@@ -59,6 +59,9 @@ class Observed:
     suspects : callable, optional
         From a fit to what may have happened besides single outliers (`errormotion.estimation.checks.candidates`). With
         it, outliers and what is found are excluded or estimated, each with a note.
+    refuses_contradictions : bool
+        Whether a contradiction that the readings do not resolve, such as a ball that has moved where all balls are
+        needed, is refused; otherwise the readings are used, with a note.
     name : callable, optional
         From the index of a reading to its name in these notes: "sphere 2 at 30 deg, sensor 1".
     extras : mapping of str to DataArray
@@ -86,6 +89,7 @@ class Observed:
     noise_increases: bool = True
     refresh: Callable[[Problem, Any], Problem] | None = None
     suspects: Callable[[Fit], Iterable[Candidate]] | None = None
+    refuses_contradictions: bool = False
     name: Callable[[Index], str] | None = None
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)

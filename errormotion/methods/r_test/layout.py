@@ -239,7 +239,7 @@ def expected(settings: Settings) -> xr.Dataset:
             "displacement_noise": ((), settings.noise, m),
             "sensor_direction_uncertainty": ((), settings.direction_uncertainty, {"units": "rad"}),
             "gain_uncertainty": ((), settings.gain_uncertainty, {"units": "1"}),
-            "position_uncertainty": ((), 0.1e-3, m),
+            "position_uncertainty": ((), settings.position_uncertainty, m),
             "nest_uncertainty": ((), settings.nest_uncertainty, m),
         },
         {"angle": ("angle", angle, {"units": "rad"}), "direction": list("xyz")},

@@ -84,6 +84,7 @@ class RTest(ModelMethod):
             recorded=("displacement", ("angle", "sphere", "sensor")),
             suspects=_suspects(layout, problem),
             name=layout.name_of,
+            refuses_contradictions=True,
             dims=("angle",),
             coords={"angle": ("angle", layout.angle, {"units": "rad", "long_name": f"angle of {layout.axis}"})},
             component=layout.axis,
@@ -225,7 +226,6 @@ def _suspects(layout: Layout, problem: Problem) -> Callable[[Fit], Sequence[Cand
         sphere,
         -np.einsum("ni,nij->nj", layout.sensor[sensor], layout.turn[angle]),
         lambda which, cut: f"sphere {which + 1} has moved on the table before {layout.degrees(int(cut))}",
-        exclude=False,
     )
 
     def found(fitted: Fit) -> Sequence[Candidate]:

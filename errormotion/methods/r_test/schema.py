@@ -11,10 +11,7 @@ ASSUMED_POSITION = 0.1e-3
 
 
 def _scalar(name: str, unit: str, high: float, meaning: str, required: bool = False) -> Row:
-    """Return the row of a standard uncertainty."""
-    return Row(
-        name, (), unit, 0.0, high, meaning if name.endswith("noise") else f"standard uncertainty {meaning}", required
-    )
+    return Row(name, (), unit, 0.0, high, meaning, required)
 
 
 RAW_SCHEMAS = (
@@ -51,15 +48,26 @@ RAW_SCHEMAS = (
             ),
             Row("axis_point", ("direction",), "m", *POSITION, "a point of the nominal line of the axis"),
             _scalar("displacement_noise", "m", 1e-3, "standard deviation of one displacement; else from the residuals"),
-            _scalar("sensor_direction_uncertainty", "rad", 0.2, "of each sensor, in each direction across it", True),
-            _scalar("gain_uncertainty", "1", 0.2, "relative, of the gain of each sensor", True),
-            _scalar("position_uncertainty", "m", 0.01, f"of `sphere_position`; else {ASSUMED_POSITION:g}"),
+            _scalar(
+                "sensor_direction_uncertainty",
+                "rad",
+                0.2,
+                "standard uncertainty of each direction, in each direction across it",
+                True,
+            ),
+            _scalar("gain_uncertainty", "1", 0.2, "relative standard uncertainty of the gain of each sensor", True),
+            _scalar(
+                "position_uncertainty",
+                "m",
+                0.01,
+                f"standard uncertainty of each coordinate of `sphere_position`; else {ASSUMED_POSITION:g}",
+            ),
             _scalar(
                 "nest_uncertainty",
                 "m",
                 0.01,
-                "of each coordinate of the nest's zero point relative to the point that the machine is commanded to "
-                "take to the sphere; else 0",
+                "standard uncertainty of each coordinate of the nest's zero point relative to the point that the "
+                "machine is commanded to take to the sphere; else 0",
             ),
         ),
         sizes=DIRECTION,

@@ -22,4 +22,5 @@ class Settings(PluginSettings):
     noise: Length = Field(default=0.15e-6, gt=0, description="standard deviation of one displacement")
     gain_uncertainty: float = Field(default=2e-3, ge=0, description="relative, of each sensor")
     direction_uncertainty: Angle = Field(default=2e-3, ge=0, description="of each sensor")
+    position_uncertainty: Length = Field(default=0.1e-3, ge=0, description="of each coordinate of a sphere's place")
     nest_uncertainty: Length = Field(default=1e-6, ge=0, description="of the zero point of the nest, each coordinate")

@@ -9,7 +9,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.r_test import RTest, Settings
 
-METHOD, SETTINGS = RTest(), Settings()
+METHOD, SETTINGS, FOUR = RTest(), Settings(), Settings(spheres=4)
 
 
 def simulated(seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:
@@ -41,21 +41,31 @@ def test_valid_readings_have_no_note() -> None:
         assert unstated == ["The noise of the displacements is not stated, and estimated with 101 degrees of freedom."]
 
 
+SHIFT = np.array([0.6, -0.64, 0.48])
+
+
 @pytest.mark.parametrize(("sphere", "first", "size"), [(1, 14, 20e-6), (0, 30, 3e-6)])
-def test_a_sphere_that_moved_is_named_and_estimated(sphere: int, first: int, size: float) -> None:
-    raw, truth = simulated()
-    errors = METHOD.identify(moved(raw, sphere, first, size * np.array([0.6, -0.64, 0.48])))
-    notes = errors.attrs["notes"]
-    assert f"Sphere {sphere + 1} has moved on the table before {10 * first} deg" in notes[0]
+def test_a_sphere_of_four_that_moved_is_named_and_excluded(sphere: int, first: int, size: float) -> None:
+    raw, truth = METHOD.simulate(FOUR, 0)
+    errors = METHOD.identify(moved(raw, sphere, first, size * SHIFT))
+    assert f"sphere {sphere + 1} has moved on the table before {10 * first} deg" in errors.attrs["notes"][0]
     assert np.abs(scores(errors, truth)).max() < 4.5
     assert np.square(scores(errors, truth)).mean() < 1.5
+
+
+@pytest.mark.parametrize("size", [20e-6, 2e-6])
+def test_a_sphere_of_three_that_moved_is_refused(size: float) -> None:
+    """The other two do not determine the errors."""
+    raw, _ = simulated()
+    with pytest.raises(MethodError, match=r"contradict one another \(.*sphere 2 has moved on the table before 140 deg"):
+        METHOD.identify(moved(raw, 1, 14, size * SHIFT))
 
 
 def test_a_wrong_gain_is_named_and_estimated() -> None:
     raw, truth = simulated()
     raw["displacement"][..., 1] *= 1.1
     errors = METHOD.identify(raw)
-    assert "The gain of sensor 2 is not the stated one" in errors.attrs["notes"][0]
+    assert "the gain of sensor 2 is not the stated one" in errors.attrs["notes"][0]
     assert np.abs(scores(errors, truth)).max() < 4.5
 
 
