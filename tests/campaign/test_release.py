@@ -1,15 +1,14 @@
 """A machine at a real address moves only after a person has released its motions; nothing else is asked."""
 
-import os
 import re
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
 import real_bench
+from forked_commands import Commands
 from terminal import Terminal
 
 from errormotion.campaign import runner
@@ -22,6 +21,7 @@ from errormotion.errors import RunError
 
 MOTIONS = "axis-x: the machine will move: X "
 WORD = "Type 'move' to release"
+Script = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +35,18 @@ def campaign(tmp_path: Path, addresses: dict[str, str]) -> Path:
     return real_bench.write(tmp_path, addresses)
 
 
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as found:
+        yield found
+
+
 @pytest.fixture
-def on_terminal(tmp_path: Path) -> Iterator[Callable[..., Terminal]]:
+def on_terminal(tmp_path: Path, commands: Commands) -> Iterator[Callable[..., Terminal]]:
     started: list[Terminal] = []
 
     def start(*arguments: str) -> Terminal:
-        started.append(Terminal(tmp_path, *arguments, XDG_STATE_HOME=str(tmp_path / "state")))
+        started.append(Terminal(commands, tmp_path, *arguments, XDG_STATE_HOME=str(tmp_path / "state")))
         return started[-1]
 
     yield start
@@ -48,21 +54,22 @@ def on_terminal(tmp_path: Path) -> Iterator[Callable[..., Terminal]]:
         each.close()
 
 
-def in_script(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [sys.executable, "-m", "errormotion", *arguments],
-        cwd=folder,
-        env=os.environ | {"XDG_STATE_HOME": str(folder / "state")},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+@pytest.fixture
+def in_script(commands: Commands) -> Script:
+    """Return a function that runs a command without a terminal, with a text as its input."""
+
+    def run(folder: Path, *arguments: str, text: str = "") -> subprocess.CompletedProcess[str]:
+        environment = {"XDG_STATE_HOME": str(folder / "state")}
+        return commands.run(*arguments, cwd=folder, environment=environment, text=text, timeout=120.0)
+
+    return run
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("option", [[], ["--yes"], ["--detach"], ["--yes", "--json"]])
-def test_without_a_terminal_nothing_moves_unless_it_is_released(campaign: Path, option: list[str]) -> None:
+def test_without_a_terminal_nothing_moves_unless_it_is_released(
+    campaign: Path, in_script: Script, option: list[str]
+) -> None:
     found = in_script(campaign.parent, "run", "campaign.toml", *option)
     assert found.returncode == 1, found.stderr
     assert MOTIONS in found.stderr
@@ -72,7 +79,7 @@ def test_without_a_terminal_nothing_moves_unless_it_is_released(campaign: Path, 
 
 
 @pytest.mark.slow
-def test_the_option_releases_the_motions_of_a_script(campaign: Path) -> None:
+def test_the_option_releases_the_motions_of_a_script(campaign: Path, in_script: Script) -> None:
     found = in_script(campaign.parent, "run", "campaign.toml", "--yes", "--move", "--no-report")
     assert found.returncode == 0, found.stderr
     assert MOTIONS in found.stderr
@@ -120,16 +127,8 @@ def test_what_was_typed_before_the_question_releases_nothing(
 
 
 @pytest.mark.slow
-def test_the_word_of_a_pipe_releases_nothing(campaign: Path) -> None:
-    found = subprocess.run(
-        [sys.executable, "-m", "errormotion", "run", "campaign.toml"],
-        cwd=campaign.parent,
-        env=os.environ | {"XDG_STATE_HOME": str(campaign.parent / "state")},
-        input="move\n" * 10,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+def test_the_word_of_a_pipe_releases_nothing(campaign: Path, in_script: Script) -> None:
+    found = in_script(campaign.parent, "run", "campaign.toml", text="move\n" * 10)
     assert found.returncode == 1, found.stderr
     assert "Nothing has moved" in found.stderr
     assert not (campaign.parent / "runs").exists()
@@ -218,7 +217,7 @@ def test_an_identified_again_test_needs_no_release(campaign: Path) -> None:
 
 @pytest.mark.slow
 def test_programs_that_move_a_real_machine_are_released_too(
-    campaign: Path, on_terminal: Callable[..., Terminal]
+    campaign: Path, on_terminal: Callable[..., Terminal], in_script: Script
 ) -> None:
     folder = campaign.parent
     refused = in_script(folder, "program", "campaign.toml", "--out", "programs")

@@ -72,7 +72,7 @@ def attacked(served: Any, path: str, number: int = CONNECTIONS) -> Iterator[None
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == b"sent\n"
-            time.sleep(1.0)  # all of them at work
+            time.sleep(0.3)  # all of them at work
             yield
         finally:
             process.kill()

@@ -99,16 +99,26 @@ class Commands:
             os.close(theirs_out)
             os.close(theirs_err)
 
+    def start_on(
+        self, terminal: int, *arguments: Any, cwd: Path | None = None, environment: Mapping[str, str] | None = None
+    ) -> Command:
+        """Start a command whose input and output is a terminal."""
+        empty = [os.open(os.devnull, os.O_RDONLY) for _ in range(2)]
+        return Command(self._server, self._fork(arguments, cwd, environment, *3 * [terminal]), *empty)
+
     def run(
         self,
         *arguments: Any,
         cwd: Path | None = None,
         environment: Mapping[str, str] | None = None,
+        text: str = "",
         timeout: float = 300.0,
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command to its end; return its exit status and what it wrote, however much."""
-        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-            pid = self._fork(arguments, cwd, environment, out.fileno(), err.fileno())
+        """Run a command with an input to its end; return its exit status and what it wrote, however much."""
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as given:
+            given.write(text.encode())
+            given.seek(0)
+            pid = self._fork(arguments, cwd, environment, out.fileno(), err.fileno(), given.fileno())
             until = time.monotonic() + timeout
             while (status := _ask(self._server, {"poll": pid})) is None:
                 if time.monotonic() > until:
@@ -127,13 +137,14 @@ class Commands:
         environment: Mapping[str, str] | None,
         out: int,
         err: int,
+        given: int | None = None,
     ) -> int:
         request = {
             "arguments": list(map(str, arguments)),
             "cwd": str(cwd or Path.cwd()),
             "environment": dict(environment or {}),
         }
-        return int(_ask(self._server, request, [out, err]))
+        return int(_ask(self._server, request, [out, err] if given is None else [out, err, given]))
 
 
 def _ask(server: socket.socket, request: Any, descriptors: Sequence[int] = ()) -> Any:
@@ -144,7 +155,7 @@ def _ask(server: socket.socket, request: Any, descriptors: Sequence[int] = ()) -
 def _serve(client: socket.socket) -> tuple[Any, list[int]]:
     """Answer requests; return, in a forked process, a command and its descriptors. Ends with its client."""
     while True:
-        message, descriptors, *_ = socket.recv_fds(client, LARGEST, 2)
+        message, descriptors, *_ = socket.recv_fds(client, LARGEST, 3)
         if not message:
             os._exit(0)
         request = json.loads(message)
@@ -174,7 +185,7 @@ def _main() -> None:
     gc.freeze()
     request, descriptors = _serve(socket.socket(fileno=int(sys.argv[1])))
     os.setsid()
-    for number, each in enumerate(descriptors, 1):
+    for number, each in zip((1, 2, 0), descriptors, strict=False):
         os.dup2(each, number)
         os.close(each)
     os.chdir(request["cwd"])

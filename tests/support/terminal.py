@@ -3,26 +3,20 @@
 import os
 import pty
 import select
-import subprocess
-import sys
+import signal
 import time
 from pathlib import Path
+
+from forked_commands import Commands
 
 
 class Terminal:
     """``errormotion ARGUMENTS`` on a terminal."""
 
-    def __init__(self, folder: Path, *arguments: str, **environment: str) -> None:
+    def __init__(self, commands: Commands, folder: Path, *arguments: str, **environment: str) -> None:
         self._own, theirs = pty.openpty()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "errormotion", *arguments],
-            cwd=folder,
-            env=os.environ | {"COLUMNS": "400", "TERM": "dumb"} | environment,
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
-            start_new_session=True,
-        )
+        variables = {"COLUMNS": "400", "TERM": "dumb"} | environment
+        self.process = commands.start_on(theirs, *arguments, cwd=folder, environment=variables)
         os.close(theirs)
         self.shown = ""
 
@@ -44,13 +38,14 @@ class Terminal:
         end = time.monotonic() + seconds
         while self._read():
             assert time.monotonic() < end, self.shown
-        return self.process.wait(10)
+        self.process.communicate(10)
+        assert self.process.returncode is not None
+        return self.process.returncode
 
     def close(self) -> None:
         """End the command."""
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+        self.process.send_signal(signal.SIGKILL)
+        self.process.close()
         os.close(self._own)
 
     def _read(self) -> bool:

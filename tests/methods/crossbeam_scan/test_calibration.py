@@ -210,7 +210,7 @@ WALLS = {"seen": Disturbances(steepest=np.inf), "lost": Disturbances()}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("walls", WALLS)
-@pytest.mark.parametrize("lean", [0.0, 3e-3, 10e-3])
+@pytest.mark.parametrize("lean", [3e-3, 10e-3])
 def test_the_uncertainty_holds_where_a_tilted_line_of_sight_meets_the_wall(scan_pocket, gantry, lean, walls):
     squares = []
     for seed in range(10):
