@@ -27,8 +27,8 @@ __all__ = ["Datum", "Relative", "relative"]
 
 EXACT = 256
 """Largest number of values with a weight that become sources of their own."""
-ROUNDING = 1e-12
-"""Remainder of an effect, relative to it, that is rounding."""
+ROUNDING = 1e-9
+"""Remainder of an effect, relative to it, that is rounding: derivatives by differences are accurate to some 1e-10."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,6 +148,11 @@ class Layout:
 
     @cached_property
     def determined(self) -> NDArray[np.bool_]:
+        """Which of the freedoms `seen` each angle determines, (n, 6); none where another one has an effect as well."""
+        return self._by_angle & ~(self._by_angle & ~self.seen).any(axis=1, keepdims=True)
+
+    @cached_property
+    def _by_angle(self) -> NDArray[np.bool_]:
         """Which freedoms the readings at each angle determine, (n, 6); none if one of them is mixed with others.
 
         From the motions that no reading at this angle sees: a freedom is determined if it is no part of them, and
@@ -166,16 +171,17 @@ class Layout:
         seen, mixed = null[..., 0] < _NULL, (null[..., 0] >= _NULL) & (null[..., 0] <= 1 - _NULL)
         return np.asarray(seen & ~mixed.any(axis=1, keepdims=True))
 
-    @property
+    @cached_property
     def seen(self) -> NDArray[np.bool_]:
-        """Which freedoms are determined at any angle, (6,).
+        """Which freedoms are determined at most angles, (6,).
 
         Raises
         ------
         MethodError
             None is.
         """
-        found = self.determined.any(axis=0)
+        patterns, count = np.unique(self._by_angle, axis=0, return_counts=True)
+        found = patterns[np.argmax(count)]
         if not found.any():
             raise MethodError(
                 f"No freedom of axis {self.axis} follows from the readings: one sphere off the axis shows EX, EY and "
