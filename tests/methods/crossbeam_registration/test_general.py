@@ -103,7 +103,7 @@ def test_a_ball_has_no_rotation():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.2e-6, 10e-6])
-@pytest.mark.parametrize("points", [600, 1500, 4000])
+@pytest.mark.parametrize("points", [600, 4000])
 @pytest.mark.parametrize("shape", [pebble, waves])
 def test_the_covariance_holds_at_any_density(shape, points, noise):
     squares = []
@@ -127,7 +127,7 @@ def test_the_covariance_holds_at_any_density(shape, points, noise):
     ],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
-@pytest.mark.parametrize("points", [600, 1500, 4000])
+@pytest.mark.parametrize("points", [600, 4000])
 @pytest.mark.parametrize("noise", [0.2e-6, 2e-6])
 def test_freedoms_that_a_shape_leaves_undetermined_are_named_at_any_density(shape, loose, points, noise):
     for seed in range(3):
