@@ -133,7 +133,7 @@ def _common(own: Array, A: Array, H: Array, HDH: Array, group: str) -> tuple[Arr
 def _difference(effect: Array, removed: Array) -> Array:
     """Return the effect of a source without the part of the datum; exactly 0 where nothing but rounding remains."""
     left = effect - removed
-    rounding = ROUNDING * np.nanmax(np.abs(effect), axis=0, initial=0.0)
+    rounding = ROUNDING * float(np.nanmax(np.abs(effect), initial=0.0))
     return np.asarray(np.where(np.abs(left) <= rounding, 0.0, left))
 
 
