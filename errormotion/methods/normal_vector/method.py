@@ -31,6 +31,8 @@ class NormalVector:
             "rotations unless the balls lie at different heights along it",
             "bending and expansion of the axes: they are assumed to move as one rigid frame",
             "drift faster than the interval of the probing cycles",
+            "expansion of the balls' posts, of the stylus and of the probe: it appears as an error of the machine",
+            "another angle of the spindle than in the cold cycle: the runout of the tip appears as EX and EY",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import validate
+from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector, Settings
 
@@ -43,6 +44,49 @@ def test_c_frame_taken_for_a_gantry_is_reported(probed, off):
     assert not any("scatter" in note for note in right.attrs["notes"])
     # The machine's turn about X shears the balls along Y and does not lift them: a rigid motion takes half of it.
     assert np.abs(wrong["EA"].values[-1] - right["EA"].values[-1]) > 10 * sigma(right)[-1, 3]
+
+
+@pytest.mark.parametrize("noise", ["stated", "unknown"])
+@pytest.mark.parametrize(("kind", "stated", "right"), [("cframe", "XYZ", "Z"), ("gantry", "Z", "XYZ")])
+def test_axes_that_contradict_the_touches_are_refused_with_those_that_agree(probed, kind, stated, right, noise):
+    """Balls at rest seem to move, and without them the other touches agree: one true error in four was within U."""
+    for seed in range(3):
+        _, raw = probed(kind, seed)
+        raw = raw if noise == "stated" else raw.drop_vars("touch_noise")
+        with pytest.raises(MethodError, match=f"contradict tool_axes = {stated},.*agree with .*{right}"):
+            METHOD.identify(raw.assign_attrs(tool_axes=stated))
+
+
+def test_a_ball_that_moved_is_no_contradiction_of_the_axes(probed):
+    for balls in (4, 5):
+        raw = probed("cframe", 2, balls=balls, moved=(1, 1500.0, (4e-6, -3e-6, 3e-6)))[1]
+        notes = " ".join(METHOD.identify(raw).attrs["notes"])
+        assert "moved before cycle 3" in notes
+        assert "would agree" not in notes
+
+
+def test_assumed_axes_of_the_tool_are_in_a_note(probed):
+    raw = probed()[1]
+    unknown = raw.drop_attrs(deep=False).assign_attrs({k: v for k, v in raw.attrs.items() if k != "tool_axes"})
+    assumed = "Assumed, because it is not stated: X, Y and Z carry the tool (tool_axes = XYZ)."
+    assert assumed in METHOD.identify(unknown).attrs["notes"]
+    for stated in (METHOD.identify(raw), METHOD.identify(unknown, Settings(tool_axes="XYZ"))):
+        assert assumed not in stated.attrs["notes"]
+
+
+def test_without_interpolation_a_cycle_has_the_mean_time_of_its_valid_touches(probed):
+    """The motion is the mean over the touches: at the start of the cycle it would be that of another time."""
+    _, raw = probed("cframe", 1)
+    flag = raw["touch_flag"].values.copy()
+    flag[2, :, :2] = 1  # missing touches are not part of the mean
+    raw = raw.assign(touch_flag=(raw["touch_flag"].dims, flag, raw["touch_flag"].attrs))
+    errors = METHOD.identify(raw, Settings(interpolate=False))
+    expected = np.where(flag == 0, raw["touch_time"].values, np.nan)
+    np.testing.assert_allclose(errors["time"].values, np.nanmean(expected, axis=(1, 2)), atol=1e-9)
+    assert errors["time"].values[2] > raw["touch_time"].values[2].mean() + 1.0
+    np.testing.assert_array_equal(errors["cycle_time"].values, raw["time"].values)
+    untimed = METHOD.identify(raw.drop_vars("touch_time"), Settings(interpolate=False))
+    np.testing.assert_array_equal(untimed["time"].values, raw["time"].values)
 
 
 def test_data_state_the_axes_that_carry_the_tool(probed):

@@ -16,6 +16,7 @@ from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.estimation.variance import expansion
 from errormotion.methods.normal_vector.identification import normals, rigid
+from errormotion.methods.normal_vector.identification.contradiction import agreeing_axes
 from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
 from errormotion.methods.normal_vector.identification.moved import Cleaned, clean
 from errormotion.methods.normal_vector.identification.reading import Readings, check_balls, check_jumps, read
@@ -53,6 +54,8 @@ def identify_motion(raw: xr.Dataset, settings: Settings, method: str, version: s
     data = read(raw, settings, notes)
     stated = bool(np.isfinite(data.noise))
     data, motion, cleaned = fitted(data, settings)
+    if settings.robust:
+        notes += _contradiction(data, motion, cleaned, settings, stated)
     factor = _noise_factor(cleaned.fit, stated, settings, notes)
     notes += _exclusions(cleaned, data)
     best = _rigid_estimate(cleaned, motion, factor, len(data.seen.cycle_time))
@@ -135,6 +138,31 @@ def _motion(data: Readings, settings: Settings) -> Motion:
     check_layout(centre, names, data.tool_axes)
     point = settings.functional_point
     return Motion(data.tool_axes, np.round(centre.mean(axis=0), 4) if point is None else np.array(point, float))
+
+
+def _contradiction(data: Readings, motion: Motion, cleaned: Cleaned, settings: Settings, stated: bool) -> list[str]:
+    """Return a note if the touches may contradict the axes that carry the tool; raise MethodError if they do."""
+    found = agreeing_axes(
+        data.seen,
+        motion,
+        cleaned,
+        interpolate=settings.interpolate and data.timed,
+        stated=stated,
+        smallest_move=settings.smallest_move,
+    )
+    if not found:
+        return []
+    other = " or ".join(axes or "none" for axes in found)
+    if len(cleaned.moves) + int(cleaned.wrong.sum()) == 1 and len(cleaned.used) == len(data.seen.cycle_time):
+        return [
+            f"All touches would agree without any exclusion if other axes carried the tool: {other} instead of "
+            f"{motion.tool_axes or 'none'} (tool_axes). Check the machine."
+        ]
+    raise MethodError(
+        f"The touches contradict tool_axes = {motion.tool_axes or 'none'}, the axes that carry the tool: balls seem to "
+        f"move, or touches scatter. All of them agree with {other}. State the axes that carry the tool (attribute "
+        "tool_axes of the data, which has priority, or the setting)."
+    )
 
 
 def _noise_factor(found: rigid.Rigid, stated: bool, settings: Settings, notes: list[str]) -> float:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from errormotion.methods.normal_vector.settings import Settings
 
-_AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
+AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
+"""Linear axes that may carry the tool."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     if "ball_radius" in raw and touched:
         radius = _array(raw, "ball_radius", "ball") + float(raw["tip_radius"])
     axes = str(raw.attrs.get("tool_axes", settings.tool_axes))
-    if axes not in _AXES:
+    if axes not in AXES:
         raise MethodError(f"tool_axes: expected the linear axes that carry the tool, such as XYZ or Z; found '{axes}'")
+    if "tool_axes" not in raw.attrs and "tool_axes" not in settings.model_fields_set:
+        notes.append("Assumed, because it is not stated: X, Y and Z carry the tool (tool_axes = XYZ).")
     if "tool_axes" in raw.attrs and axes != settings.tool_axes and "tool_axes" in settings.model_fields_set:
         notes.append(
             f"The data state that {axes or 'no axis'} carries the tool; the setting {settings.tool_axes} was not used."
