@@ -13,6 +13,8 @@ from errormotion.twin import VirtualMachine
 
 TRACKER_SCALE = 0.5e-6
 """Relative error of the tracker's lengths, one standard deviation."""
+STILL_AIR = {"temperature_uncertainty": 0.0, "pressure_uncertainty": 0.0, "humidity_uncertainty": 0.0}
+"""Of the virtual tracker, whose lengths are those in the air."""
 
 
 def subjects() -> tuple[MethodSubject, ...]:
@@ -23,7 +25,11 @@ def subjects() -> tuple[MethodSubject, ...]:
     subject = MethodSubject(
         Multilateration,
         tracker_readings,
-        settings={"scale_uncertainty": TRACKER_SCALE, "planning": {"minimise": "mean", "boxes": boxes}},
+        settings={
+            "scale_uncertainty": TRACKER_SCALE,
+            "air": STILL_AIR,
+            "planning": {"minimise": "mean", "boxes": boxes},
+        },
         raw_vectors={"target_nominal": "point", "station_nominal": "point", "reflector": "point"},
         optional=("station_nominal", "reflector", "reading_time"),
         measured=("displacement",),

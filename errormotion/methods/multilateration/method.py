@@ -23,12 +23,13 @@ class Multilateration:
         id="multilateration",
         summary="Volumetric error and the errors of three axes from tracker distances, stations and dead paths unknown",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",
             "with one reflector position: rotations of the axis that carries it, and others with the same effect",
             "drift that displaces and rotates the machine as a whole from one set-up to the next",
+            "errors of the reflector that depend on its angle to the beam: they appear as errors of the machine",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("laser_tracker",), raw_schema=SCHEMA)

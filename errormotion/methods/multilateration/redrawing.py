@@ -43,7 +43,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     if settings.together and "repeatability" in errors:
         sources["repeatability"] = _positions(float(errors["repeatability"]), errors)
     refraction = float(np.linalg.norm(list(air_scale(raw, settings.air, [])[1].values())))  # all have the same effect
-    for group, relative in (("refraction", refraction), ("scale of the tracker", settings.scale_uncertainty)):
+    for group, relative in (("refraction", refraction), ("scale of the tracker", settings.scale_or_assumed)):
         if relative > 0:
             sources[group] = _scale(relative, group)
     if settings.expansion is not None:

@@ -16,7 +16,7 @@ RAW_SCHEMAS = (
                 "m",
                 -100.0,
                 100.0,
-                "interferometer reading; NaN = beam broken",
+                "interferometer reading, which increases with the distance; NaN = beam broken",
                 missing=True,
             ),
             Row("target_nominal", ("target", "direction"), "m", -100.0, 100.0, "commanded position of the reflector"),

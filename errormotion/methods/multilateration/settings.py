@@ -12,6 +12,8 @@ from errormotion.plugins import PluginSettings
 
 HELIUM_NEON = 632.9912e-9
 """Wavelength in vacuum of a red helium-neon laser, m."""
+ASSUMED_SCALE = 0.5e-6
+"""Relative standard uncertainty of a tracker's lengths that is assumed if none is stated."""
 CO2 = 450e-6
 """Carbon dioxide in laboratory air, mole fraction."""
 
@@ -229,8 +231,11 @@ class Settings(PluginSettings):
     )
 
     # Scale
-    scale_uncertainty: Relative = Field(
-        default=0.0, ge=0, description="relative standard uncertainty of the tracker's lengths, without that of the air"
+    scale_uncertainty: Relative | None = Field(
+        default=None,
+        ge=0,
+        description="relative standard uncertainty of the tracker's lengths, without that of the air; if not stated, "
+        "0.5 um/m is assumed, with a note",
     )
     air: Air = Field(default_factory=Air, description="the air along the beam")
     expansion: Expansion | None = Field(
@@ -247,3 +252,8 @@ class Settings(PluginSettings):
     station_tolerance: Length = Field(
         default=0.1, gt=0, description="distance of a station from its approximate position above which a note is given"
     )
+
+    @property
+    def scale_or_assumed(self) -> float:
+        """Relative standard uncertainty of the tracker's lengths, stated or assumed."""
+        return ASSUMED_SCALE if self.scale_uncertainty is None else self.scale_uncertainty

@@ -42,7 +42,8 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     Parameters
     ----------
     settings : Settings
-        Layout, repeatability and scale uncertainty are used; the last one is the standard deviation of a scale error.
+        Layout, repeatability and scale uncertainty are used; the last one is the standard deviation of a scale error,
+        0 if not stated.
     seed : int
         Of the machine and of the measurement.
 
@@ -63,7 +64,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         reflector=layout.reflector,
         noise=layout.displacement_noise,
         repeatability=settings.repeatability or 0.0,
-        scale=settings.scale_uncertainty * np.random.default_rng([seed, 3]).normal(),
+        scale=(settings.scale_uncertainty or 0.0) * np.random.default_rng([seed, 3]).normal(),
     )
     return measured, true_errors(machine, position, layout.reflector)
 

@@ -37,6 +37,9 @@ def spread(ds):
     return np.sqrt(np.einsum("tii->ti", ds["covariance"].values[:, :3, :3]))
 
 
+STILL_AIR = {"temperature_uncertainty": 0.0, "pressure_uncertainty": 0.0, "humidity_uncertainty": 0.0}
+
+
 def notes(ds):
     return "\n".join(ds.attrs["notes"])
 
@@ -58,7 +61,12 @@ def test_the_result_is_an_error_dataset_with_all_variables_of_the_report(raw, er
     for name in ("station_place", "station_covariance", "dead_path", "residual", "left_out", "iterations", "condition"):
         assert name in errors
     assert np.isnan(errors["EA"].values).all()
-    assert list(errors.em.budget()["group"].values) == ["stations", "independent"]
+    assert list(errors.em.budget()["group"].values) == [
+        "stations",
+        "refraction",
+        "scale of the tracker",
+        "independent",
+    ]
     assert int(errors["iterations"]) < 10
     assert "ECY: not distinguishable from EXY" in notes(errors)
     assert errors["ECY"].attrs["unseen"] == "not distinguishable from EXY"
@@ -169,15 +177,64 @@ def test_without_a_chain_there_are_no_axes(raw):
 # ---------------------------------------------------------------- scale
 
 
-def test_the_uncertainty_of_the_scale_is_in_the_budget(raw, errors):
-    found = Multilateration().identify(raw, Settings(scale_uncertainty="2 um/m"))
-    assert "Assumed: no uncertainty of the tracker's lengths (scale_uncertainty = 0)." in notes(errors)
-    assert "tracker's lengths" not in notes(found)
+def test_the_uncertainty_of_the_scale_is_in_the_budget(raw):
+    found = Multilateration().identify(raw, Settings(scale_uncertainty="2 um/m", air=STILL_AIR))
     budget = found.em.budget()
-    assert list(budget["group"].values) == ["stations", "scale of the tracker", "independent"]
+    assert list(budget["group"].values) == ["stations", "refraction", "scale of the tracker", "independent"]
     place = raw["target_nominal"].values
     shape = 2e-6 * (place - place.mean(axis=0))
-    np.testing.assert_allclose(np.abs(budget.values[1][:, :3]), np.abs(shape), atol=1e-9)
+    np.testing.assert_allclose(np.abs(budget.values[2][:, :3]), np.abs(shape), atol=1e-9)
+
+
+def test_assumed_uncertainties_are_noted_and_change_no_value(raw, errors):
+    exact = Multilateration().identify(raw, Settings(scale_uncertainty=0.0, air=STILL_AIR))
+    assert "an uncertainty of the tracker's lengths of 0.5 um/m (scale_uncertainty)" in notes(errors)
+    assert "an uncertainty of the air of 0.2 K of its temperature, 50 Pa of its pressure, 5 %" in notes(errors)
+    assert "Assumed" not in notes(exact)
+    np.testing.assert_array_equal(vectors(errors), vectors(exact))
+    place = raw["target_nominal"].values
+    # 0.2 K, 50 Pa and 5 % are 0.24 um/m of the air, with 0.5 um/m 0.55 um/m.
+    further = np.sqrt(spread(errors) ** 2 - spread(exact) ** 2)
+    np.testing.assert_allclose(further, 0.55e-6 * np.abs(place - place.mean(axis=0)), rtol=0.02, atol=2e-9)
+
+
+def test_scale_errors_of_a_tracker_that_states_none_are_within_the_uncertainty(machine):
+    """The noise is that of a good interferometer; half of the intervals of outer targets missed the truth without."""
+    q = simulation.target_grid(machine, (4, 4, 3))
+    truth, held = vectors(simulation.true_errors(machine, q)), []
+    outer = np.abs(q - q.mean(axis=0)) > 0.9 * np.abs(q - q.mean(axis=0)).max(axis=0)
+    for seed in range(20):
+        scale = 0.5e-6 * float(np.random.default_rng(seed).normal())
+        raw = simulation.raw(machine, q, seed=seed, noise=0.02e-6, scale=scale)
+        found = Multilateration().identify(raw, Settings(parametric=False))
+        held.append(np.mean((np.abs(vectors(found) - truth) < 1.96 * spread(found))[outer]))
+    # 20 independent scale errors, of which 95 % are within the interval: 4 sigma of their share are 0.2.
+    assert np.mean(held) > 0.75
+
+
+def test_what_is_assumed_of_reflector_expansion_and_chain_is_noted(raw, errors):
+    blank = Multilateration().identify(raw.drop_vars("reflector"))
+    assert "with all axes at zero the reflector is at zero (reflector)" in notes(blank)
+    assert "reflector is at zero" not in notes(errors)
+    np.testing.assert_array_equal(vectors(blank), vectors(errors))
+    assert "temperature of the measurement" in notes(errors)
+    warm = Multilateration().identify(raw, Settings(expansion={"coefficient": 11.5e-6, "temperature": 23.0}))
+    assert "temperature of the measurement" not in notes(warm)
+    assert "of the scales of 1 um/m/K (expansion.coefficient_uncertainty)" in notes(warm)
+    other = "workpiece-bed-Z-Y-X-spindle-tool"
+    turned = Multilateration().identify(raw, Settings(chain=other))
+    assert f"The data state the chain {raw.attrs['chain']}; the setting {other} is used." in notes(turned)
+
+
+def test_mirrored_axes_are_noted_at_every_station_and_opposite_readings_refused(raw):
+    mirror = np.array([-1.0, 1.0, 1.0])
+    for name in ("target_nominal", "station_nominal"):
+        mirrored = raw.assign({name: (raw[name].dims, raw[name].values * mirror, raw[name].attrs)})
+        found = notes(Multilateration().identify(mirrored, Settings(parametric=False)))
+        assert all(f"Station S{k} is " in found for k in (1, 2, 3, 4))
+    opposite = raw.assign(displacement=(raw["displacement"].dims, -raw["displacement"].values, {"units": "m"}))
+    with pytest.raises(MethodError, match="opposite sign: a displacement increases with the distance"):
+        Multilateration().identify(opposite)
 
 
 def test_lengths_in_vacuum_are_converted_to_lengths_in_air(raw, errors):

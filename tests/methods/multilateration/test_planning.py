@@ -45,7 +45,7 @@ def test_a_plan_is_an_error_dataset_of_zeros_that_conforms_to_the_schema(ds):
 
 
 def test_expected_uncertainty_is_the_scatter_of_measurements():
-    settings = Settings(layout=LAYOUT, air=STILL)
+    settings = Settings(layout=LAYOUT, air=STILL, scale_uncertainty=0.0)
     ds = plan(Multilateration.info, settings, NARROW)
     target, U = layout.grid(settings.layout)[1], np.array(CLOSE)
     rng = np.random.default_rng(2)

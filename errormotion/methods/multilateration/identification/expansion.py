@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from errormotion.methods.multilateration.settings import Air, Expansion
 
+LABORATORY = (20.0, 101325.0, 0.5)
+"""Temperature (degC), pressure (Pa) and humidity at which the effect of an unrecorded state of the air is computed."""
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
 
 
@@ -61,10 +63,10 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
                 f"expected {', '.join(missing)} (station, target). Add them, or omit refractive_index."
             )
         notes.append(
-            "The state of the air is not in the data: displacements are assumed to be compensated, and the uncertainty "
-            "of the scale is scale_uncertainty. An error of 1 K of the air temperature changes lengths by 1 um/m."
+            "The state of the air is not in the data: displacements are assumed to be compensated for it. An error of "
+            "1 K of the air temperature changes lengths by 1 um/m."
         )
-        return 1.0, {}
+        return 1.0, _causes(*LABORATORY, air.wavelength, air)
     T, p, h = (np.asarray(raw[name].transpose("station", "target").values, dtype=float) for name in _AIR)
     _refuse_unknown_air(raw, {"air_temperature": T, "air_pressure": p, "relative_humidity": h})
     wavelength = float(raw["vacuum_wavelength"]) if "vacuum_wavelength" in raw else air.wavelength
@@ -73,14 +75,19 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
         used = np.asarray(raw["refractive_index"].transpose("station", "target").values, dtype=float)
         factor = used / refractive_index(T, p, h, air.co2, wavelength)
     mean_T, mean_p, mean_h = (float(np.nanmean(value)) for value in (T, p, h))
-    derivatives = sensitivities(mean_T, mean_p, mean_h, air.co2, wavelength)
+    return factor, _causes(mean_T, mean_p, mean_h, wavelength, air)
+
+
+def _causes(temperature: float, pressure: float, humidity: float, wavelength: float, air: Air) -> dict[str, float]:
+    """Return the relative standard uncertainties of lengths in air of this state, by cause."""
+    derivatives = sensitivities(temperature, pressure, humidity, air.co2, wavelength)
     stated = {
         "temperature": air.temperature_uncertainty,
         "pressure": air.pressure_uncertainty,
         "humidity": air.humidity_uncertainty / 100,
     }
     causes = {f"air {name}": abs(float(u)) for name, u in index_uncertainty(derivatives, stated).items()}
-    return factor, causes | {"wavelength": air.wavelength_uncertainty}
+    return causes | {"wavelength": air.wavelength_uncertainty}
 
 
 def _refuse_unknown_air(raw: xr.Dataset, air: dict[str, Array]) -> None:

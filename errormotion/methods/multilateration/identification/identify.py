@@ -16,6 +16,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import repeatability
+from errormotion.methods.multilateration.identification.assumed import assumptions
 from errormotion.methods.multilateration.identification.drift import estimate_drift, positions
 from errormotion.methods.multilateration.identification.expansion import (
     air_scale,
@@ -54,6 +55,7 @@ def prepare(raw: xr.Dataset, settings: Settings) -> State:
     """Return the state with readings at the refractive index of the air, without weakly determined targets."""
     notes: list[str] = []
     data = read(raw, notes)
+    notes += assumptions(raw, settings)
     factor, scale = air_scale(raw, settings.air, notes)
     machine = repeatability.stated(settings.repeatability, settings.repeatability_uncertainty)
     state = State(raw, settings, data, notes, data.displacement * factor, scale, machine)

@@ -38,10 +38,7 @@ def evaluate_scatter(state: State) -> None:
                 f"Station {data.stations[j]} is {off[j] * 1e3:.3g} mm from its approximate position. Check this "
                 "position, and that the targets are stated in machine coordinates."
             )
-    if settings.scale_uncertainty > 0:
-        state.scale["tracker scale"] = settings.scale_uncertainty
-    else:
-        state.notes.append("Assumed: no uncertainty of the tracker's lengths (scale_uncertainty = 0).")
+    state.scale["tracker scale"] = settings.scale_or_assumed
     if not network.converged:
         state.notes.append(
             f"The network has not converged after {network.iterations} iterations; its results are approximate."

@@ -243,7 +243,7 @@ def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[st
     index = index_uncertainty(sensitivities(*_AIR, air.co2, air.wavelength), u)
     scales = {f"air {name}": ("air", float(abs(value))) for name, value in index.items()}
     scales["wavelength"] = ("air", air.wavelength_uncertainty)
-    scales["scale of the tracker"] = ("tracker", settings.scale_uncertainty)
+    scales["scale of the tracker"] = ("tracker", settings.scale_or_assumed)
     names = [name for name, (_, value) in scales.items() if value > 0]
     groups = [scales[name][0] for name in names]
     effects = [scales[name][1] * centred for name in names]
