@@ -17,6 +17,10 @@ class CheckFailedError(AssertionError):
     """A plugin does not meet the requirement of a check."""
 
 
+class DoesNotApplyError(Exception):
+    """A check does not apply to a plugin, as its result shows; the message states the reason."""
+
+
 @dataclass(frozen=True)
 class CheckResult:
     """Result of one check.
@@ -54,8 +58,9 @@ def applies_always(subject: object) -> str:  # noqa: ARG001 - one signature for 
 class Check(Generic[Subject]):
     """A named requirement for plugins, and the function that checks it.
 
-    ``why_not(subject)`` is empty if the check applies, else the reason why it does not. ``limit`` is its time limit, s,
-    or a function that returns it; infinite for a check with its own limits.
+    ``why_not(subject)`` is empty if the check applies, else the reason why it does not; it is evaluated when tests are
+    collected, and must be fast. The function raises a `DoesNotApplyError` with a reason that only a result shows.
+    ``limit`` is the time limit, s, or a function that returns it; infinite for a check with its own limits.
     """
 
     name: str
@@ -105,6 +110,8 @@ def run_check(check: Check[Subject], subject: Subject) -> CheckResult:
                 box.append(result(True, f"does not apply: {reason}", skipped=True))
             else:
                 box.append(result(True, check.function(subject)))
+        except DoesNotApplyError as cause:
+            box.append(result(True, f"does not apply: {cause}", skipped=True))
         except CheckFailedError as failure:
             box.append(result(False, str(failure)))
         except Exception as error:  # noqa: BLE001 - a plugin under test may raise anything

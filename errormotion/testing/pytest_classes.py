@@ -1,9 +1,13 @@
-"""The kit as test classes with one test for each check; pytest collects subclasses named ``Test...``."""
+"""The kit as test classes with one test for each check; pytest collects subclasses named ``Test...``.
+
+A check that is found not to apply while it runs is a skipped test; ``test_NAME = None`` in the subclass omits it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, ClassVar
+from unittest import SkipTest
 
 from errormotion.plugins import CompensatorSubject, InstrumentSubject, MethodSubject
 from errormotion.testing.kit import Check, CheckFailedError, run_check
@@ -14,6 +18,8 @@ def _as_test(check: Check[Any]) -> Callable[[Any], None]:
     def test(self: Any) -> None:
         __tracebackhide__ = True
         result = run_check(check, self.subject)
+        if result.skipped:
+            raise SkipTest(result.message)
         if not result.ok:
             raise CheckFailedError(f"{check.claim}\n{result.message}\n{result.trace}".rstrip())
 
@@ -24,7 +30,7 @@ def _as_test(check: Check[Any]) -> Callable[[Any], None]:
 
 def _give_tests(cls: type, subject: Any) -> None:
     for check in checks_for(subject):
-        if not check.why_not(subject):
+        if f"test_{check.name}" not in vars(cls) and not check.why_not(subject):
             setattr(cls, f"test_{check.name}", _as_test(check))
 
 

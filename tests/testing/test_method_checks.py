@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from unittest import SkipTest
 
 import numpy as np
 import pytest
@@ -310,6 +311,12 @@ class StatesFigures(Sound):
         return last_values(errors)
 
 
+class StatesFiguresOfOtherVariables(Sound):
+    @staticmethod
+    def figures(errors):
+        return [replace(each, value=each.expanded_uncertainty) for each in last_values(errors)]
+
+
 class IsTooSureOfItsFigures(Sound):
     @staticmethod
     def figures(errors):
@@ -383,6 +390,23 @@ def test_a_method_that_draws_its_sources_as_stated_passes():
     results = {result.name: result for result in run_checks(replace(SOUND, plugin=Redrawn, seeds=20))}
     assert [name for name, result in results.items() if not result.ok] == []
     assert not results["sources_as_stated"].skipped
+
+
+def test_figures_that_do_not_follow_from_the_errors_are_not_checked_which_only_a_run_shows():
+    made = []
+
+    def counted(seed):
+        made.append(seed)
+        return make(seed)
+
+    class Tests(MethodConformance):
+        subject = replace(SOUND, plugin=StatesFiguresOfOtherVariables, make=counted)
+        test_schema = None
+
+    assert made == []
+    assert Tests.test_schema is None
+    with pytest.raises(SkipTest, match="no figures that follow from its errors alone"):
+        Tests().test_figures()
 
 
 def test_a_method_with_honest_figures_passes():
