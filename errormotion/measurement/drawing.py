@@ -73,7 +73,7 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     if observed.recorded is None:
         raise ValueError("simulate: expected a model that states 'recorded', the variable of its readings")
     problem = observed.problem
-    exact = solve(replace(observed, noise_increases=False, suspects=None))
+    exact = solve(replace(observed, noise_increases=False, robust=False))
     drawn = {name: generator.standard_normal(number) for name, number in _drawn(problem).items()}
     true = _moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)

@@ -17,6 +17,7 @@ from errormotion.estimation.checks.candidates import Candidate
 from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import cleaned
 from errormotion.estimation.checks.exclusions import notes as exclusion_notes
+from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.components import noise_variance
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
@@ -36,16 +37,30 @@ _SAME = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The solution of a model: the fit, what its residuals say about the noise, and the errors with their datum."""
+    """The solution of a model.
+
+    Attributes
+    ----------
+    observed : Observed
+        Without outliers, which are not looked for any more.
+    fit : Fit
+    scatter : Scatter
+        What the residuals say about the noise.
+    relative : Relative
+        The errors with their datum.
+    given : Problem
+        The problem with all readings.
+    """
 
     observed: Observed
     fit: Fit
     scatter: Scatter
     relative: Relative
+    given: Problem
 
 
 def solve(observed: Observed) -> Solved:
-    """Return the solution of a problem; its ``observed`` is without outliers, and without suspects.
+    """Return the solution of a problem.
 
     Raises
     ------
@@ -53,6 +68,7 @@ def solve(observed: Observed) -> Solved:
         The readings do not determine the unknowns, or neither noise nor redundancy is there.
     """
     try:
+        given = observed.problem
         observed, found = _cleaned(observed)
         problem = observed.problem
         priors = _has_priors(problem)
@@ -79,14 +95,14 @@ def solve(observed: Observed) -> Solved:
         factor = (1.0 if estimated else scatter.factor) * float(expansion(scatter.freedom)) ** 2
         final = estimated[0] if estimated else found
         errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
-        return Solved(observed, final, scatter, related(observed, errors))
+        return Solved(observed, final, scatter, related(observed, errors), given)
     except FitError as error:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
 
 
 def _cleaned(observed: Observed) -> tuple[Observed, Fit]:
     """Return what was observed without outliers, with a note on each, and the fit."""
-    if observed.suspects is None:
+    if not observed.robust:
         return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what)
     problem, what = observed.problem, observed.what
     first = fit(problem, refresh=observed.refresh, what=what)
@@ -100,11 +116,12 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit]:
         words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
     except FitError as error:
         # The readings as such determine the unknowns: too many of them would have to be excluded.
-        raise _contradiction(what, [_likeliest(first, observed.suspects(first))]) from error
+        suspects = () if observed.suspects is None else observed.suspects(first)
+        raise _contradiction(what, [_likeliest(first, suspects)]) from error
     if words and observed.refuses_contradictions:
         raise _contradiction(what, words)
     sentences = [*observed.notes, *exclusion_notes(found, what.removeprefix("the "))]
-    return replace(observed, problem=found.fit.problem, suspects=None, notes=sentences), found.fit
+    return replace(observed, problem=found.fit.problem, robust=False, notes=sentences), found.fit
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:
@@ -193,7 +210,7 @@ def dataset(
     datum = solved.relative
     if planned:
         datum = replace(datum, coefficient=np.zeros_like(datum.coefficient))
-    extras = dict(observed.extras) | dict(model.results(observed, solved.fit, datum))
+    extras = dict(observed.extras) | _of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum))
     return build_errors(
         _placed(value, observed, shape),
         _square(errors.covariance, observed, shape),
@@ -218,6 +235,31 @@ def dataset(
         measured=None if planned else raw.attrs,
         **observed.attributes,
     ).assign_attrs(notes=[note for note in notes if note] or [""])
+
+
+def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return residuals, exclusions and reliability of the readings, over their dims in the raw data."""
+    recorded, given = solved.observed.recorded, solved.given
+    if recorded is None or solved.fit.residual.size != given.readings.size:
+        return {}
+    name, dims = recorded
+    shape = tuple(raw.sizes[dim] for dim in dims)
+    unit = str(raw[name].attrs.get("units", "1"))
+    found = reliability(solved.fit, factor=solved.scatter.factor)
+    out = np.isfinite(given.readings) & ~np.isfinite(solved.fit.problem.readings)
+    residual = replace(solved.fit.problem, readings=given.readings).residuals(solved.fit.linear.at)
+    parts: dict[str, tuple[Array, dict[str, str]]] = {
+        "residual": (residual, {"units": unit, "long_name": "reading minus fitted, also of excluded readings"}),
+        "redundancy": (found.redundancy, {"units": "1", "long_name": "share of an error that the residual shows"}),
+        "smallest_error": (
+            found.smallest,
+            {"units": unit, "long_name": "smallest gross error that would be found with a probability of 80 %"},
+        ),
+        "left_out": (out.astype(np.int8), {"long_name": "1 = excluded"}),
+    }
+    return {
+        name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs) for name, (values, attrs) in parts.items()
+    }
 
 
 def _size(observed: Observed, dim: str) -> int:

@@ -56,9 +56,11 @@ class Observed:
         Whether the uncertainties follow the residuals if these scatter more than stated.
     refresh : callable, optional
         See `errormotion.estimation.fit.fit`.
+    robust : bool
+        Whether outliers among the readings are excluded, with a note, by one rule with its rate of false alarms.
     suspects : callable, optional
-        From a fit to what may have happened besides single outliers (`errormotion.estimation.checks.candidates`). With
-        it, outliers and what is found are excluded or estimated, each with a note.
+        From a fit to what may have happened besides single outliers (`errormotion.estimation.checks.candidates`), which
+        is then excluded or estimated as well.
     refuses_contradictions : bool
         Whether a contradiction that the readings do not resolve, such as a ball that has moved where all balls are
         needed, is refused; otherwise the readings are used, with a note.
@@ -88,6 +90,7 @@ class Observed:
     noise_cause: str = ""
     noise_increases: bool = True
     refresh: Callable[[Problem, Any], Problem] | None = None
+    robust: bool = True
     suspects: Callable[[Fit], Iterable[Candidate]] | None = None
     refuses_contradictions: bool = False
     name: Callable[[Index], str] | None = None

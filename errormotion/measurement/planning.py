@@ -24,6 +24,6 @@ def plan(model: Model, settings: Any, info: MethodInfo) -> xr.Dataset:
         A test with these settings does not determine the result.
     """
     raw = model.expected(settings)
-    observed = replace(model.observe(raw, settings), noise_increases=False, suspects=None)
+    observed = replace(model.observe(raw, settings), noise_increases=False, robust=False)
     origin = provenance.make(settings, None, None, steps=["plan"])
     return dataset(model, solve(observed), raw, info, origin, planned=True)

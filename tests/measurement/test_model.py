@@ -150,6 +150,26 @@ def test_a_time_without_reading_is_unknown() -> None:
         METHOD.identify(raw, SETTINGS)
 
 
+def test_an_outlier_is_excluded_and_named() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    raw["reading"][4, 2] += 20e-6
+    errors = METHOD.identify(raw, SETTINGS)
+    assert np.argwhere(errors["left_out"].values).tolist() == [[4, 2]]
+    assert "1 of them is not used" in errors.attrs["notes"][0]
+    first = raw["reading"].values[0].mean()
+    mean = raw["reading"].values[4, [0, 1, 3, 4]].mean() - first
+    assert errors["EZ"].values[4] == pytest.approx(mean, abs=1e-12)
+    # four of five readings remain at this time: one of them has 3/4 of its error in its residual
+    assert errors["redundancy"].values[4, 0] == pytest.approx(3 / 4)
+    assert errors["redundancy"].values[3, 0] == pytest.approx(4 / 5)
+    assert errors["residual"].values[4, 2] == pytest.approx(raw["reading"].values[4, 2] - mean - first)
+
+
+def test_valid_readings_are_rarely_excluded() -> None:
+    seeds = [METHOD.identify(METHOD.simulate(SETTINGS, seed)[0], SETTINGS) for seed in range(60)]
+    assert sum(int(errors["left_out"].sum()) for errors in seeds) <= 1  # one in a thousand data sets is expected
+
+
 def test_plan_and_identification_have_the_same_sources() -> None:
     planned = METHOD.plan(SETTINGS)
     errors = METHOD.identify(METHOD.expected(SETTINGS), SETTINGS)
