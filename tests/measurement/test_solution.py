@@ -128,5 +128,5 @@ def test_an_outlier_and_a_step_are_named_and_repaired() -> None:
 def test_an_unknown_noise_without_redundancy_is_refused() -> None:
     y = np.full(N, np.nan)
     y[3] = 1e-6
-    with pytest.raises(MethodError, match="(?i)no redundancy"):
+    with pytest.raises(MethodError, match=r"(?i)no redundancy"):
         solve(observed(y, None))
