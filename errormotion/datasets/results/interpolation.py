@@ -9,8 +9,11 @@ intensity of an interval is that of the second differences at its ends. The firs
 value before it. The machine is assumed to be steady until then: the slope is 0 before, and its means over the first two
 intervals are s and s'. The slope changes at least by the range J of these three, and ``q = J^2 / h``: the process whose
 slope changes by J (one standard deviation) within the interval. A single change of this size, anywhere in it, deviates
-from the line by sqrt(3) standard deviations. Sources that are one draw for many values are interpolated with the same
-weights. Nothing is extrapolated.
+from the line by sqrt(3) standard deviations.
+
+A step between two values, by a switched compensation or a stop, is not contained: in simulations 44 % of the 95 %
+intervals between the two held. Sources that are one draw for many values are interpolated with the same weights.
+Nothing is extrapolated.
 """
 
 from __future__ import annotations
