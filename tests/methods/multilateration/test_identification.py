@@ -199,7 +199,7 @@ def test_assumed_uncertainties_are_noted_and_change_no_value(raw, errors):
 
 
 def test_scale_errors_of_a_tracker_that_states_none_are_within_the_uncertainty(machine):
-    """The noise is that of a good interferometer; half of the intervals of outer targets missed the truth without."""
+    """The noise is that of a good interferometer, so that a scale that is not in U would miss the outer targets."""
     q = simulation.target_grid(machine, (4, 4, 3))
     truth, held = vectors(simulation.true_errors(machine, q)), []
     outer = np.abs(q - q.mean(axis=0)) > 0.9 * np.abs(q - q.mean(axis=0)).max(axis=0)
