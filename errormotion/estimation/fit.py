@@ -193,10 +193,12 @@ def _step(linear: Linear, what: str) -> tuple[Normal, tuple[Array, Array], float
 def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
     """Return the unknowns after the step, or after the largest half of it that does not increase the sum."""
     before = linear.chi2 + linear.prior_square()
+    # Residuals r with errors d of rounding have the sum r'r + 2 r'd.
+    most = before * (1 + ROUNDING) + ROUNDING + 2 * np.sqrt(before * _rounding(linear))
     fraction = 1.0
     for _ in range(HALVINGS):
         at = linear.moved(fraction * step[0], fraction * step[1])
-        if _square(linear, at) <= before * (1 + ROUNDING) + ROUNDING:
+        if _square(linear, at) <= most:
             return at
         fraction /= 2
     return linear.moved(fraction * step[0], fraction * step[1])
@@ -219,10 +221,14 @@ def _whitened(linear: Linear) -> Array:
 def _unit(linear: Linear) -> float:
     """Return the variance factor of the readings, at least that of the rounding of their numbers."""
     used = max(int(linear.used.sum()), 1)
+    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, _rounding(linear) / used)
+
+
+def _rounding(linear: Linear) -> float:
+    """Return the sum of squares of the errors that rounding of the readings makes in the whitened residuals."""
     y = column(linear.problem.y)
     size = np.abs(linear.whitener).sum(axis=2) * np.abs(y).max(axis=1, initial=0.0, keepdims=True)
-    rounding = float(np.sum(np.square(EPS * size))) / used
-    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, rounding)
+    return float(np.sum(np.square(EPS * size)))
 
 
 def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:

@@ -16,7 +16,10 @@ from errormotion.estimation.blocks import Block, Constant, Index, Noise, Table
 from errormotion.estimation.derivatives import along, by_rows, column
 from errormotion.estimation.normal import Normal, factorised
 
-__all__ = ["Linear", "Problem", "linearised"]
+__all__ = ["READINGS", "Linear", "Problem", "linearised"]
+
+READINGS = "readings"
+"""Name of the derivatives by the readings among analytic ones."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,7 +44,8 @@ class Problem:
         Changes of unknowns by name that no reading sees, such as a motion of a whole network.
     derivatives : callable, optional
         ``derivatives(y, x, c)`` returns analytic derivatives of the residuals, (n, m, width) or (n, m, w, width), by
-        name, for any of the unknowns; those of the others are differences.
+        name, for any of the unknowns, and as `READINGS` those by the numbers of the readings, (n, m, r); those of the
+        others are differences.
     """
 
     equation: Callable[[Array, Any, Any], Array]
@@ -351,8 +355,11 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
     raw = problem.residuals(at)
     used = np.isfinite(raw)
     n, m = raw.shape
-    J = _derivatives(problem, tables, values, rows)
-    whitener = _whitener(problem, rows, used)
+    given: Mapping[str, Array] = {}
+    if problem.derivatives is not None:
+        given = problem.derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
+    J = _derivatives(problem, tables, values, given)
+    whitener = _whitener(problem, rows, used, given.get(READINGS))
     r = (whitener @ np.where(used, raw, 0.0)[..., None])[..., 0]
     parts, numbers = [], []
     local = np.zeros((n, m, 0, 1))
@@ -374,26 +381,25 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
     return Linear(problem, at, number, r, used, whitener, local, border, columns)
 
 
-def _derivatives(problem: Problem, tables: list[Table], values: list[Array], rows: list[Array]) -> list[Array]:
+def _derivatives(problem: Problem, tables: list[Table], values: list[Array], given: Mapping[str, Array]) -> list[Array]:
     """Return the derivatives (n, m, w, width) by all unknowns, then by the adjusted constants."""
     count = len(problem.unknowns)
     known: dict[int, Array] = {}
-    if problem.derivatives is not None:
-        given = problem.derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
-        for name, J in given.items():
-            k = problem.unknowns._fields.index(name)
-            table = tables[k]
-            whole = J[:, :, None, :] if J.ndim == 3 else J
-            if table.weight is not None:
-                whole = whole * table.weight[:, None, :, None]
-            known[k] = whole
+    for k, name in enumerate(problem.unknowns._fields):
+        if name not in given:
+            continue
+        J, table = given[name], tables[k]
+        whole = J[:, :, None, :] if J.ndim == 3 else J
+        if table.weight is not None:
+            whole = whole * table.weight[:, None, :, None]
+        known[k] = whole
     wanted = [k for k in range(count) if k not in known] + [count + k for k in problem.adjusted]
     found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted)
     by_number = {**known, **dict(zip(wanted, found, strict=True))}
     return [by_number[k] for k in [*range(count), *(count + k for k in problem.adjusted)]]
 
 
-def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_]) -> Array:
+def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_], by_readings: Array | None) -> Array:
     """Return the inverse square roots of the covariances of the residuals, (n, m, m); 0 for missing ones.
 
     With ``L = dr/dy``, which is 1 for a reading minus its prediction, the covariance is that of the reading times L
@@ -402,7 +408,9 @@ def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_]) -> A
     y = column(problem.y)
     scale = np.broadcast_to(np.asarray(problem.reading_scale, dtype=float), (y.shape[1],))
     shape = problem.y.shape
-    L = along(lambda moved: problem.evaluate(moved.reshape(shape), rows), y, scale)
+    L = by_readings
+    if L is None:
+        L = along(lambda moved: problem.evaluate(moved.reshape(shape), rows), y, scale)
     V = problem.noise.covariance((len(y), y.shape[1]))
     V = L @ V @ np.swapaxes(L, 1, 2)
     m = used.shape[1]

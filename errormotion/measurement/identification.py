@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
 from errormotion.estimation.checks.candidates import Candidate
 from errormotion.estimation.checks.effects import information, solved
-from errormotion.estimation.checks.exclusions import cleaned
+from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.exclusions import notes as exclusion_notes
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.components import noise_variance
@@ -23,9 +23,9 @@ from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Errors, errors_of
-from errormotion.estimation.variance import Scatter, expansion, variance_factor
+from errormotion.estimation.variance import expansion, variance_factor
 from errormotion.kinematics.iso import DOF
-from errormotion.measurement.observed import Model, Observed
+from errormotion.measurement.observed import Model, Observed, Solved
 from errormotion.plugins import MethodInfo
 
 __all__ = ["Solved", "dataset", "estimated_noise", "identify", "solve"]
@@ -33,30 +33,6 @@ __all__ = ["Solved", "dataset", "estimated_noise", "identify", "solve"]
 _STEPS = 10
 _SAME = 1e-6
 """Relative change of the variance of the noise that ends its estimation."""
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """The solution of a model.
-
-    Attributes
-    ----------
-    observed : Observed
-        Without outliers, which are not looked for any more.
-    fit : Fit
-    scatter : Scatter
-        What the residuals say about the noise.
-    relative : Relative
-        The errors with their datum.
-    given : Problem
-        The problem with all readings.
-    """
-
-    observed: Observed
-    fit: Fit
-    scatter: Scatter
-    relative: Relative
-    given: Problem
 
 
 def solve(observed: Observed) -> Solved:
@@ -69,7 +45,7 @@ def solve(observed: Observed) -> Solved:
     """
     try:
         given = observed.problem
-        observed, found = _cleaned(observed)
+        observed, found, search = _cleaned(observed)
         problem = observed.problem
         priors = _has_priors(problem)
         estimated: list[Fit] = []
@@ -88,6 +64,7 @@ def solve(observed: Observed) -> Solved:
             estimate=estimate if priors else None,
             what=observed.what,
             cause=observed.noise_cause,
+            size=observed.noise_size,
         )
         if estimated and scatter.factor == 1.0 and problem.noise.stated:
             estimated.clear()  # not larger than stated
@@ -95,33 +72,42 @@ def solve(observed: Observed) -> Solved:
         factor = (1.0 if estimated else scatter.factor) * float(expansion(scatter.freedom)) ** 2
         final = estimated[0] if estimated else found
         errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
-        return Solved(observed, final, scatter, related(observed, errors), given)
+        solved = Solved(observed, final, scatter, related(observed, errors), given, search)
+        return solved if observed.finish is None else observed.finish(solved)
     except FitError as error:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
 
 
-def _cleaned(observed: Observed) -> tuple[Observed, Fit]:
-    """Return what was observed without outliers, with a note on each, and the fit."""
+def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
+    """Return what was observed without outliers, with a note on each, the fit, and what was found."""
     if not observed.robust:
-        return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what)
+        return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what), None
     problem, what = observed.problem, observed.what
-    first = fit(problem, refresh=observed.refresh, what=what)
     if not problem.noise.stated and _has_priors(problem):
         # Else a unit of noise would hide what the readings say about the constants.
-        first = estimated_noise(first, refresh=observed.refresh, what=what)[0]
+        problem = estimated_noise(
+            fit(problem, refresh=observed.refresh, what=what), refresh=observed.refresh, what=what
+        )[0].problem
     try:
         found = cleaned(
-            first.problem, suspects=observed.suspects, name=observed.name, refresh=observed.refresh, what=what
+            problem,
+            suspects=observed.suspects,
+            whole=observed.whole,
+            name=observed.name,
+            refresh=observed.refresh,
+            structure=observed.structure,
+            what=what,
         )
-        words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
     except FitError as error:
-        # The readings as such determine the unknowns: too many of them would have to be excluded.
+        # Too many readings would have to be excluded, if all of them determine the unknowns.
+        first = fit(problem, refresh=observed.refresh, what=what)
         suspects = () if observed.suspects is None else observed.suspects(first)
         raise _contradiction(what, [_likeliest(first, suspects)]) from error
+    words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
     if words and observed.refuses_contradictions:
         raise _contradiction(what, words)
     sentences = [*observed.notes, *exclusion_notes(found, what.removeprefix("the "))]
-    return replace(observed, problem=found.fit.problem, robust=False, notes=sentences), found.fit
+    return replace(observed, problem=found.fit.problem, robust=False, notes=sentences), found.fit, found
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:

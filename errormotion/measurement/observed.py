@@ -13,12 +13,14 @@ if TYPE_CHECKING:
 
     from errormotion.estimation.blocks import Index
     from errormotion.estimation.checks.candidates import Candidate
+    from errormotion.estimation.checks.exclusions import Cleaned
     from errormotion.estimation.datum import Datum, Relative
     from errormotion.estimation.fit import Fit
     from errormotion.estimation.problem import Problem
     from errormotion.estimation.sources import Places
+    from errormotion.estimation.variance import Scatter
 
-__all__ = ["Model", "Observed"]
+__all__ = ["Model", "Observed", "Solved"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,6 +54,8 @@ class Observed:
         The readings, as the subject of a sentence of the notes: "the touches".
     noise_cause : str
         A remedy, for the note on readings that scatter more than stated.
+    noise_size : callable, optional
+        From a factor for the standard deviation of the noise to the noise in words: "1.3 um".
     noise_increases : bool
         Whether the uncertainties follow the residuals if these scatter more than stated.
     refresh : callable, optional
@@ -66,6 +70,13 @@ class Observed:
         needed, is refused; otherwise the readings are used, with a note.
     name : callable, optional
         From the index of a reading to its name in these notes: "sphere 2 at 30 deg, sensor 1".
+    whole : bool
+        Whether all numbers of a reading are wrong together; see `errormotion.estimation.checks.exclusions.cleaned`.
+    structure : callable, optional
+        What depends on the readings that are used; see there. ``problem`` fulfils it.
+    finish : callable, optional
+        From the solution to one with whatever else follows from it: names, notes and variables of the result, or other
+        errors. Called after each solution, also that of a plan and of a trial.
     extras : mapping of str to DataArray
         Further variables of the result that follow from the raw data.
     attributes : mapping
@@ -88,15 +99,46 @@ class Observed:
     shared: str = "readings"
     what: str = "the readings"
     noise_cause: str = ""
+    noise_size: Callable[[float], str] | None = None
     noise_increases: bool = True
     refresh: Callable[[Problem, Any], Problem] | None = None
     robust: bool = True
     suspects: Callable[[Fit], Iterable[Candidate]] | None = None
     refuses_contradictions: bool = False
     name: Callable[[Index], str] | None = None
+    whole: bool = False
+    structure: Callable[[Problem], Problem] | None = None
+    finish: Callable[[Solved], Solved] | None = None
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The solution of a model.
+
+    Attributes
+    ----------
+    observed : Observed
+        Without outliers, which are not looked for any more.
+    fit : Fit
+    scatter : Scatter
+        What the residuals say about the noise.
+    relative : Relative
+        The errors with their datum.
+    given : Problem
+        The problem with all readings.
+    cleaned : Cleaned, optional
+        What was excluded; None if nothing was searched.
+    """
+
+    observed: Observed
+    fit: Fit
+    scatter: Scatter
+    relative: Relative
+    given: Problem
+    cleaned: Cleaned | None = None
 
 
 class Model(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -342,3 +343,36 @@ def test_a_fit_that_starts_at_its_solution_has_the_same_solution() -> None:
 def test_a_prior_of_zero_is_refused() -> None:
     with pytest.raises(FitError, match="above 0"):
         straight(np.linspace(0, 1, 7), np.zeros(7), prior=np.array([1.0, 0.0]))
+
+
+def test_derivatives_by_the_readings_may_be_given() -> None:
+    x = np.linspace(0, 1, 7)
+    y = 2 + 3 * x + 0.1 * np.random.default_rng(0).standard_normal(7)
+    plain = straight(x, y)
+    evaluations = []
+
+    def equation(*at: Any) -> Array:
+        evaluations.append(1)
+        return plain.equation(*at)
+
+    def derivatives(y: Array, u: Line[Array], c: Any) -> dict[str, Array]:
+        J = -np.stack([np.ones(7), x], axis=1)[:, None]
+        return {"line": J, problems.READINGS: np.full((7, 1, 1), 2.0)}
+
+    given = fit(replace(plain, equation=equation, derivatives=derivatives))
+    expected = fit(plain)
+    assert given.unknowns.line == pytest.approx(expected.unknowns.line)
+    assert given.chi2 == pytest.approx(expected.chi2 / 4)  # twice the noise
+    assert len(evaluations) <= 8  # no differences
+
+
+def test_rounding_of_large_readings_does_not_halve_the_steps() -> None:
+    """At 4 m and a noise of 0.25 um the sum of squares is known to 1e-6; its derivatives are known far better."""
+    x = np.linspace(0, 1, 600)
+    y = 4 + 1e-5 * x + 0.25e-6 * np.random.default_rng(0).standard_normal(600)
+    noisy = replace(straight(x, y), noise=Noise(sd=np.full(600, 0.25e-6)))
+    steps: list[float] = []
+    found = fit(noisy, refresh=lambda problem, u: steps.append(u.line[0, 0]) or problem)
+    line = np.polynomial.polynomial.polyfit(x, y, 1)
+    assert found.unknowns.line[0] == pytest.approx(line, abs=1e-12)
+    assert len(steps) <= 4

@@ -20,6 +20,7 @@ from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places
 from errormotion.measurement import ModelMethod, Observed
 from errormotion.measurement.drawing import READINGS
+from errormotion.measurement.identification import Solved
 from errormotion.montecarlo.trials import redrawing_of, trial, values_of
 from errormotion.plugins import MethodInfo, Needs, PluginSettings
 
@@ -221,3 +222,31 @@ def test_simulation_needs_the_variable_of_the_readings() -> None:
 
     with pytest.raises(ValueError, match="recorded"):
         Silent().simulate(SETTINGS, 0)
+
+
+def test_an_unknown_noise_has_its_size_in_words() -> None:
+    class Worded(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            return replace(super().observe(raw, settings), noise_size=lambda size: f"{size * 1e6:.2g} um")
+
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    note = Worded().identify(raw.drop_vars("reading_noise"), SETTINGS).attrs["notes"][0]
+    assert " um from the residuals" in note
+
+
+def test_what_follows_from_a_solution_is_part_of_result_plan_and_trials() -> None:
+    class Further(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            def finish(solved: Solved) -> Solved:
+                largest = xr.DataArray(float(np.nanmax(solved.relative.errors.value)), attrs={"units": "m"})
+                return replace(solved, observed=replace(solved.observed, extras={"largest": largest}))
+
+            return replace(super().observe(raw, settings), finish=finish)
+
+    method = Further()
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = method.identify(raw, SETTINGS)
+    assert float(errors["largest"]) == float(errors["EZ"].max())
+    assert "largest" in method.plan(SETTINGS)
+    redrawing = redrawing_of(method, raw, SETTINGS, errors)
+    assert "largest" in trial(method, redrawing, np.random.SeedSequence(7))

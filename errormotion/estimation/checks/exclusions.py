@@ -142,6 +142,7 @@ def cleaned(
     false_alarm: float = FALSE_ALARM,
     name: Callable[[Index], str] | None = None,
     refresh: Callable[[Problem, Any], Problem] | None = None,
+    structure: Callable[[Problem], Problem] | None = None,
     what: str = "the readings",
 ) -> Cleaned:
     """Fit a problem and exclude its outliers.
@@ -158,6 +159,9 @@ def cleaned(
         Probability of excluding anything from valid data.
     name : callable, optional
         From the index of a number (reading, number), or of a reading (reading,), to its name in messages.
+    structure : callable, optional
+        From a problem without some readings to the one that is fitted: what depends on the readings that are used, such
+        as the unknowns that they determine, and their index maps. A `FitError` means that they do not suffice.
     refresh, what
         See `fit`. With candidates that add unknowns, ``refresh`` must change the problem that it is given.
 
@@ -166,7 +170,7 @@ def cleaned(
     FitError
         As `fit`; or the search does not end.
     """
-    search = _Search(problem, suspects, whole, false_alarm, name or _numbered, refresh, what)
+    search = _Search(problem, suspects, whole, false_alarm, name or _numbered, refresh, structure, what)
     return search.run()
 
 
@@ -204,6 +208,7 @@ class _Search:
     false_alarm: float
     name: Callable[[Index], str]
     refresh: Callable[[Problem, Any], Problem] | None
+    structure: Callable[[Problem], Problem] | None
     what: str
     made: list[Exclusion] = field(default_factory=list)
     undecided: list[Exclusion] = field(default_factory=list)
@@ -231,6 +236,8 @@ class _Search:
     def fitted(self, problem: Problem, before: Fit | None = None) -> Fit:
         """Return the fit of a problem, from the solution of one with the same unknowns or one table less."""
         start = None
+        if self.structure is not None:
+            problem = self.structure(problem)
         if before is not None:
             more = [block.start for block in problem.unknowns[len(before.problem.unknowns) :]]
             start = Unknown([*before.linear.at.tables, *more], before.linear.at.adjusted)
@@ -258,7 +265,9 @@ class _Search:
             chance = noise.chance(structures[0].gain, structures[0].k)
             if chance < search.limit:
                 # What a single number explains as well is a single number: it excludes less.
-                suspects = [each for each in suspects if each.chance <= chance + RIVAL / 2]
+                # Its gain is that of the number alone: several numbers, each given the others, are the change itself.
+                alone = [noise.chance(float(numbers.gain[each.at]), numbers.k) for each in suspects]
+                suspects = [each for each, own in zip(suspects, alone, strict=True) if own <= chance + RIVAL / 2]
                 if not suspects:
                     return self.structured(found, structures, chance, trials, noise.unit), none
         return self.excluded(found, suspects, trials) if suspects else (None, none)

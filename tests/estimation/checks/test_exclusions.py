@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -317,3 +318,40 @@ def test_valid_data_have_no_note_and_others_one_sentence() -> None:
     text = notes(cleaned(levels(4, 2, pair)))
     assert len(text) == 1
     assert text[0].startswith("One of reading 5, reading 6 is wrong") or "reading 6, reading 5" in text[0]
+
+
+def test_unknowns_without_readings_are_left_out_where_the_structure_says_so() -> None:
+    """All readings of a level are wrong together: without them nothing determines it."""
+    rng = np.random.default_rng(5)
+    y = rng.standard_normal((6, 4))
+    y[3] += [0.0, 30.0, -30.0, 15.0]
+    whole = np.zeros(y.shape, dtype=bool)
+    whole[3] = True
+
+    def suspects(found: Fit) -> list[Candidate]:
+        design = np.where(whole.ravel()[:, None], np.tile(np.eye(4), (6, 1)), 0.0)
+        return [Candidate(words="cycle 3", design=design, excluded=whole.ravel(), trials=6)]
+
+    def structure(problem: Problem) -> Problem:
+        level = problem.unknowns.level
+        free = np.bincount(level.index[np.isfinite(problem.readings)], minlength=6) > 0
+        return replace(problem, unknowns=problem.unknowns._replace(level=replace(level, free=free)))
+
+    with pytest.raises(FitError, match="level 4"):
+        cleaned(levels(6, 4, y), suspects=suspects)
+    found = cleaned(levels(6, 4, y), suspects=suspects, structure=structure)
+    assert names(found) == ["cycle 3"]
+    assert np.flatnonzero(~found.fit.problem.unknowns.level.free).tolist() == [3]
+    assert found.fit.freedom == 20 - 5 - 3
+
+
+def test_two_steps_at_once_are_no_outliers() -> None:
+    """Each reading of a step has a large gain given the others, but alone a smaller one than the step."""
+    rng = np.random.default_rng(8)
+    y = rng.standard_normal((12, 6))
+    y[3:, 2] += 12.0
+    y[7:, 4] += 12.0
+    problem = levels(12, 6, y)
+    cycle, ball = np.divmod(np.arange(y.size), 6)
+    search = steps(cycle.astype(float), ball, np.ones((y.size, 1)), lambda i, t: f"{i} from {t:g}")
+    assert sorted(names(cleaned(problem, suspects=search))) == ["2 from 3", "4 from 7"]
