@@ -10,7 +10,7 @@ after which everything needs matrices of the size of Z only. With ``K = s + A D`
 contrasts
 
     Q = Z' P Z = K^-1 A,    v = Z' P y = K^-1 b,    y' P y = (c - b' D v) / s,
-    -2 log L = (n - p) log s + log |K / s| + y' P y,
+    -2 log L = (n - p) log s + log det(K / s) + y' P y,
     d(-2 log L)/d d_k = sum_k (Q_jj - v_j^2),    expected information 1/2 sum Q_ij^2,
 
 and the terms of the noise follow from ``P V P = P``. Fisher scoring finds the maximum; variances may be 0. Unknowns
