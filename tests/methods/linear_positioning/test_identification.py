@@ -174,3 +174,17 @@ def test_drift_from_run_to_run_is_shared_by_the_targets(raw_of, identify):
     u = errors.em.budget().sel(group="drift from run to run", dof="EX").values
     assert u[5] == pytest.approx(expected, rel=0.05)
     assert np.sqrt(errors.em.covariance_between(0, 10).values[0, 0]) == pytest.approx(expected, rel=0.1)
+
+
+def test_unequal_scatter_at_too_few_targets_is_stated_at_least_as_the_common_one():
+    """Four targets and five runs leave too few degrees of freedom for a variance of each target."""
+    position = np.array([0.0, 0.1, 0.25, 0.5])
+    readings = np.random.default_rng(3).standard_normal((2, 5, 4)) * 1e-6
+    readings[1] *= 1e-3  # the scatter of one approach
+    found = scatter.scatter(readings, position, kind="auto", drift=None, stated=None)
+    pooled = scatter.scatter(readings, position, kind="pooled", drift=None, stated=None)
+    assert found.unequal
+    assert not pooled.unequal
+    assert (found.own >= pooled.own).all()
+    with pytest.raises(MethodError, match=r"expected \d+ runs or more at these targets; found 5"):
+        scatter.scatter(readings, position, kind="target", drift=None, stated=None)

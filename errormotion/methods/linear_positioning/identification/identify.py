@@ -23,7 +23,7 @@ from errormotion.methods.linear_positioning.schema import APPROACHES
 from errormotion.methods.linear_positioning.settings import LIMITS, Settings, TrialSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from errormotion.plugins import MethodInfo
 
@@ -200,6 +200,7 @@ def evaluate(raw: xr.Dataset, settings: Settings, notes: list[str], *, planned: 
                 stated=stated_u.scatter if stated else None,
             )
         )
+    notes += _unequal(readings.freedoms, spreads)
     mean = np.array([_bidirectional(each) for each in x])
     systematic = [*budget.instrument_sources(raw, readings, settings, mean), *correction.sources]
     temperature = f"{settings.reference_temperature:g} degC" if correction.complete else "the temperature of the test"
@@ -217,6 +218,17 @@ def evaluate(raw: xr.Dataset, settings: Settings, notes: list[str], *, planned: 
     if any(evaluated.straight(k) for k in range(len(spreads))):
         return _straightness_from_ends(evaluated)
     return evaluated
+
+
+def _unequal(freedoms: Sequence[str], spreads: list[Scatter]) -> list[str]:
+    """Return a note if the scatter differs from target to target, and there are too few runs to state each."""
+    names = [name for name, spread in zip(freedoms, spreads, strict=True) if spread.unequal]
+    if not names:
+        return []
+    return [
+        f"The scatter of {', '.join(names)} differs from target to target, and there are too few runs to state it for "
+        "each: where it is smaller than the common one, the common one is used. Measure more runs or targets."
+    ]
 
 
 def _bidirectional(x: Array) -> Array:

@@ -58,6 +58,9 @@ class Scatter:
         Degrees of freedom of ``common`` and ``opposite``; 0 where they are stated.
     noise : ndarray, (2,)
         Variance of the coefficients of a run by ``own``, which has been subtracted.
+    unequal : bool
+        Whether the variances of the targets differ significantly, with too few runs for one of each: it is then at
+        least the common one.
     """
 
     z: Array
@@ -70,6 +73,7 @@ class Scatter:
     pooled: bool
     freedom: int
     noise: Array
+    unequal: bool = False
 
 
 def scaled(position: Array) -> Array:
@@ -118,7 +122,7 @@ def scatter(
             f"{runs} runs: the drift from run to run cannot be estimated."
         )
     residual, coefficient, g = _lines(x, Z)
-    own, factor, pooled = _own(residual, kind)
+    own, factor, pooled, unequal = _own(residual, kind)
     mean_own = float(np.nanmean(own))
     own = np.where(np.isnan(own) & np.isfinite(x).any(axis=1), mean_own, own)  # readings of runs without a line
     both = len(approaches) == 2
@@ -142,6 +146,7 @@ def scatter(
         pooled=pooled,
         freedom=runs - 1 if runs >= MIN_RUNS else 0,
         noise=noise,
+        unequal=unequal,
     )
 
 
@@ -197,8 +202,8 @@ def _lines(x: Array, Z: Array) -> tuple[Array, Array, Array]:
     return residual, coefficient, cofactors[usable].mean(axis=0)
 
 
-def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
-    """Return the variance of one reading (approach, target), its Student factor, and whether it is pooled."""
+def _own(residual: Array, kind: str) -> tuple[Array, float, bool, bool]:
+    """Return the variance of one reading (approach, target), its Student factor, whether it is pooled, and unequal."""
     known = np.isfinite(residual)
     n = known.sum(axis=1)
     square = np.where(known, residual**2, 0.0).sum(axis=1)
@@ -213,15 +218,18 @@ def _own(residual: Array, kind: str) -> tuple[Array, float, bool]:
         )
     pooled = float(square.sum() / freedom)
     if kind == "pooled" or (kind == "auto" and not _differ(square, n)):
-        return np.where(n > 0, pooled, np.nan), freedom / (freedom - 2), True
+        return np.where(n > 0, pooled, np.nan), freedom / (freedom - 2), True, False
     share = freedom / total
     each = np.where(n > 1, square / np.maximum(n - 1, 1) / share, pooled)
     own_freedom = share * (float(np.median(n[n > 0])) - 1.0)
-    if own_freedom <= 2:
-        raise MethodError(
-            f"Variances by target: expected more than {MIN_RUNS} runs; found {int(n.max())}. Use scatter 'pooled'."
-        )
-    return np.where(n > 0, each, np.nan), own_freedom / (own_freedom - 2), False
+    if own_freedom > 2:
+        return np.where(n > 0, each, np.nan), own_freedom / (own_freedom - 2), False, False
+    if kind == "auto":
+        return np.where(n > 0, np.maximum(each, pooled), np.nan), freedom / (freedom - 2), True, True
+    raise MethodError(
+        f"Variances by target: expected {int(2 / share) + 2} runs or more at these targets; found {int(n.max())}. Use "
+        "scatter 'pooled'."
+    )
 
 
 def _differ(square: Array, n: Array) -> bool:
