@@ -40,7 +40,7 @@ _ROWS = 4096
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted problem. Covariances are for the noise as stated, times ``factor``.
+    """A fitted problem. Covariances are for the noise in the problem.
 
     Attributes
     ----------

@@ -231,7 +231,7 @@ def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     name, dims = recorded
     shape = tuple(raw.sizes[dim] for dim in dims)
     unit = str(raw[name].attrs.get("units", "1"))
-    found = reliability(solved.fit, factor=solved.scatter.factor)
+    found = reliability(solved.fit, factor=solved.fit_factor)
     out = np.isfinite(given.readings) & ~np.isfinite(solved.fit.problem.readings)
     residual = replace(solved.fit.problem, readings=given.readings).residuals(solved.fit.linear.at)
     parts: dict[str, tuple[Array, dict[str, str]]] = {

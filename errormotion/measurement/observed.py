@@ -140,6 +140,11 @@ class Solved:
     given: Problem
     cleaned: Cleaned | None = None
 
+    @property
+    def fit_factor(self) -> float:
+        """Variance factor that the noise in ``fit`` lacks: 1 if it was estimated beside priors, as part of the fit."""
+        return self.scatter.factor if self.fit.problem.noise is self.observed.problem.noise else 1.0
+
 
 class Model(Protocol):
     """The measurement model of a method."""

@@ -11,6 +11,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.estimation.blocks import Block, Constant, Noise
 from errormotion.estimation.checks.candidates import steps
+from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.fit import fit
 from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places
@@ -98,6 +99,28 @@ def test_an_increased_noise_does_not_increase_the_uncertainty_of_a_prior() -> No
     assert expected <= u <= student * expected * 1.01
     slope = [source for source in solved.relative.errors.sources if source.group == "slope"]
     assert slope or solved.relative.errors.own.any()
+
+
+@pytest.mark.parametrize("prior", [True, False])
+def test_the_smallest_error_that_is_found_is_that_of_the_noise_that_was_found(prior: bool) -> None:
+    """A noise that is estimated beside a prior is in the fit already, and must not be counted twice."""
+    given = observed(readings(2, noise=1.5e-6), 0.5e-6)
+    if not prior:
+        unknowns = given.problem.unknowns
+        free = [replace(block, prior=None) for block in unknowns]
+        constants = [replace(c, adjust=False) for c in given.problem.constants]
+        its = given.problem.constants
+        problem = replace(
+            given.problem, unknowns=type(unknowns)(*free), constants=type(its)(*constants) if constants else its
+        )
+        given = replace(given, problem=problem)
+    solved = solve(given)
+    assert solved.scatter.ratio > 2
+    sd = np.asarray(solved.fit.problem.noise.sd)[0] * np.sqrt(solved.fit_factor)
+    assert sd == pytest.approx(0.5e-6 * np.sqrt(solved.scatter.factor), rel=1e-9)
+    found = reliability(solved.fit, factor=solved.fit_factor)
+    assert np.nanmin(found.smallest) > 4 * 1.1e-6  # four standard deviations at least, of about 1.5 um
+    assert np.nanmin(found.smallest) < 8 * 1.9e-6
 
 
 def test_intervals_with_an_unknown_noise_are_covered() -> None:
