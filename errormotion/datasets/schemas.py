@@ -217,6 +217,7 @@ OPTIONAL_ATTRIBUTES = {
     "reference_interval": "first and last time of the reference state, s on `time`",
     "reference_position": "position whose errors are zero by definition",
     "notes": "list of sentences for the reader",
+    "doubts_uncertainty": "those of the notes that state why an uncertainty may be too small",
     "component_description": "description of a component that the schema does not list",
     "chain": "kinematic chain of the machine, such as `workpiece-X-Y-bed-Z-spindle-tool`",
     "operator": "name of the operator",

@@ -67,6 +67,11 @@ class Scatter:
     verdict: Verdict
     note: str
 
+    @property
+    def doubtful(self) -> bool:
+        """Whether the note doubts the uncertainties: the readings scatter more than these say."""
+        return self.verdict is Verdict.MORE and self.factor == 1.0
+
 
 def variance_factor(
     chi2: float,

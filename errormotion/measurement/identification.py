@@ -13,10 +13,10 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
+from errormotion.estimation.checks import exclusions
 from errormotion.estimation.checks.candidates import Candidate
 from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import Cleaned, cleaned
-from errormotion.estimation.checks.exclusions import notes as exclusion_notes
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.components import noise_variance
 from errormotion.estimation.datum import Relative, relative
@@ -106,8 +106,16 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
     words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
     if words and observed.refuses_contradictions:
         raise _contradiction(what, words)
-    sentences = [*observed.notes, *exclusion_notes(found, what.removeprefix("the "))]
-    return replace(observed, problem=found.fit.problem, robust=False, notes=sentences), found.fit, found
+    name = what.removeprefix("the ")
+    notes, doubts = exclusions.notes(found, name), exclusions.doubts(found, name)
+    after = replace(
+        observed,
+        problem=found.fit.problem,
+        robust=False,
+        notes=[*observed.notes, *notes],
+        doubts=[*observed.doubts, *doubts],
+    )
+    return after, found.fit, found
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:
@@ -192,7 +200,9 @@ def dataset(
     shape = tuple(_size(observed, dim) for dim in observed.dims)
     value = np.where(np.isfinite(errors.value), 0.0, np.nan) if planned else errors.value
     names = _unique([source.name for source in errors.sources])
-    notes = [*observed.notes, solved.scatter.note] if not planned else [*observed.notes]
+    notes, doubts = [*observed.notes], [*observed.doubts]
+    if not planned:
+        (doubts if solved.scatter.doubtful else notes).append(solved.scatter.note)
     datum = solved.relative
     if planned:
         datum = replace(datum, coefficient=np.zeros_like(datum.coefficient))
@@ -217,10 +227,12 @@ def dataset(
         source_groups=[source.group for source in errors.sources],
         source_ids={name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
         extras=extras,
+        notes=notes,
+        doubts=doubts,
         start="" if planned else start_of(raw),
         measured=None if planned else raw.attrs,
         **observed.attributes,
-    ).assign_attrs(notes=[note for note in notes if note] or [""])
+    )
 
 
 def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:

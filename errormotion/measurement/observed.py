@@ -83,6 +83,8 @@ class Observed:
         Further arguments of `errormotion.datasets.build_errors`.
     notes : sequence of str
         What the reader of the raw data noticed.
+    doubts : sequence of str
+        Further notes: why the uncertainties may be too small. No decision on a tolerance relies on them then.
     """
 
     problem: Problem
@@ -112,6 +114,7 @@ class Observed:
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    doubts: Sequence[str] = ()
 
 
 @dataclass(frozen=True, eq=False)

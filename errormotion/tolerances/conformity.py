@@ -116,7 +116,8 @@ def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
 
     A name in ``figures`` may contain ``*`` for any characters. A freedom is within its limits if all of its known
     points are, and if these are at least the share ``least_known`` of its points; the row states the worst point.
-    Points of the reference state, and all that are 0 ± 0, are so by definition and are not counted.
+    Points of the reference state, and all that are 0 ± 0, are so by definition and are not counted. Nothing is proved
+    by an uncertainty that a note of the dataset doubts.
     """
     failure, figures = "", list[FigureOfMerit]()
     if is_planned(errors):
@@ -134,7 +135,15 @@ def judge(errors: xr.Dataset, tolerances: Tolerances) -> Conformity:
             rows.append(_of_freedom(errors, name, limit, tolerances))
         else:
             unused.append(name)
+    if tolerances.rule != "simple" and (doubts := errors.em.doubts):
+        rows = [_doubted(row, doubts[0]) for row in rows]
     return Conformity(tuple(rows), tuple(unused), tolerances, failure)
+
+
+def _doubted(row: Row, doubt: str) -> Row:
+    """Return a row that proves nothing, since its uncertainty is in doubt."""
+    remark = f"the uncertainty is in doubt: {doubt.rstrip('.')}"
+    return replace(row, decision=OPEN, remark="; ".join(filter(None, [row.remark, remark])))
 
 
 def judge_figures(figures: Sequence[FigureOfMerit], tolerances: Tolerances) -> Conformity:

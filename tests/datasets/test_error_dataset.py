@@ -181,3 +181,13 @@ def test_fifty_thousand_instants_are_checked_completely(errors) -> None:
     ds = errors(n=50_000)
     ds["covariance"][49_999, 0, 1] *= 2
     assert "symmetric" in violations(ds)
+
+
+def test_doubts_are_notes_that_are_also_stated_by_themselves(errors, tmp_path) -> None:
+    plain = errors(notes=["Cold.", ""])
+    assert plain.em.notes == ["Cold."]
+    assert plain.em.doubts == []
+    doubted = errors(notes=["Cold."], doubts=["Two readings contradict each other.", ""])
+    assert doubted.em.notes == ["Cold.", "Two readings contradict each other."]
+    datasets.save(doubted, tmp_path / "e.nc")
+    assert datasets.load(tmp_path / "e.nc").em.doubts == ["Two readings contradict each other."]

@@ -153,3 +153,11 @@ def test_an_unknown_noise_without_redundancy_is_refused() -> None:
     y[3] = 1e-6
     with pytest.raises(MethodError, match=r"(?i)no redundancy"):
         solve(observed(y, None))
+
+
+def test_readings_that_scatter_more_than_the_stated_noise_doubt_an_uncertainty_that_does_not_follow() -> None:
+    y = readings(2, noise=1.5e-6)
+    follows, fixed = solve(observed(y, 0.5e-6)), solve(replace(observed(y, 0.5e-6), noise_increases=False))
+    assert not follows.scatter.doubtful
+    assert fixed.scatter.doubtful
+    assert not solve(observed(readings(2), 0.5e-6)).scatter.doubtful

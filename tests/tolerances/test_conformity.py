@@ -197,6 +197,27 @@ def test_one_sided_limits(tmp_path: Path, errors: xr.Dataset) -> None:
     assert judge(errors, limits(tmp_path, upper)).decision == OUTSIDE
 
 
+@pytest.mark.parametrize(
+    ("rule", "limit", "expected"),
+    [
+        ("iso 14253-1", "20 um", OPEN),
+        ("iso 14253-1", "1 um", OPEN),
+        ("shared risk", "20 um", OPEN),
+        ("simple", "20 um", INSIDE),
+    ],
+)
+def test_a_doubted_uncertainty_proves_nothing(
+    tmp_path: Path, errors: xr.Dataset, rule: str, limit: str, expected: int
+) -> None:
+    stated = limits(tmp_path, f'rule = "{rule}"\nfreedoms.EX = "{limit}"')
+    assert judge(errors, stated).decision in (INSIDE, OUTSIDE)
+    doubted = errors.assign_attrs(doubts_uncertainty=["Two readings contradict each other."])
+    found = judge(doubted, stated)
+    assert found.decision == expected
+    if expected == OPEN:
+        assert "Two readings contradict each other" in found.rows[0].remark
+
+
 def test_texts_of_rules_without_guard_band_state_no_proof(tmp_path: Path, errors: xr.Dataset) -> None:
     for rule, guard in (("simple", "simple acceptance, no guard band"), ("shared risk", "at most 0.33 of half")):
         found = judge(errors, limits(tmp_path, f'rule = "{rule}"\nfreedoms = {{ EX = "5.1 um" }}'))

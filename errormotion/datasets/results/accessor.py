@@ -364,8 +364,16 @@ class ErrorMotion:
     @property
     def notes(self) -> list[str]:
         """Sentences for the reader."""
-        notes = self._ds.attrs.get("notes", [])
-        return [note for note in ([notes] if isinstance(notes, str) else list(notes)) if note]
+        return self._sentences("notes")
+
+    @property
+    def doubts(self) -> list[str]:
+        """Those of the notes that state why an uncertainty may be too small."""
+        return self._sentences("doubts_uncertainty")
+
+    def _sentences(self, name: str) -> list[str]:
+        stated = self._ds.attrs.get(name, [])
+        return [note for note in ([stated] if isinstance(stated, str) else list(stated)) if note]
 
     def budget(self) -> xr.DataArray:
         """Return the uncertainty budget: standard uncertainty (k = 1) by group of sources, and independent part.

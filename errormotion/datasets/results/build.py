@@ -44,6 +44,7 @@ def build_errors(
     reference_position: float | None = None,
     start: str = "",
     notes: Sequence[str] = (),
+    doubts: Sequence[str] = (),
     measured: Mapping[Any, Any] | None = None,
     lever_axes: str = "",
 ) -> xr.Dataset:
@@ -86,7 +87,9 @@ def build_errors(
     start : str, optional
         Instant of time 0: ISO 8601 with an offset from UTC.
     notes : sequence of str, optional
-        Notes for the reader, one sentence each.
+        Notes for the reader, one sentence each; empty ones are left out.
+    doubts : sequence of str, optional
+        Further notes: why an uncertainty may be too small. No decision on a tolerance relies on it then.
     measured : mapping, optional
         Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts are copied to the errors.
     lever_axes : str, optional
@@ -139,8 +142,10 @@ def build_errors(
         attrs["reference_position"] = float(reference_position)
     if start:
         attrs["start"] = start
-    if notes := [*notes, *provenance.get("interruptions", ())]:
-        attrs["notes"] = list(notes)
+    doubts = [note for note in doubts if note]
+    attrs["notes"] = [note for note in (*notes, *doubts, *provenance.get("interruptions", ())) if note] or [""]
+    if doubts:
+        attrs["doubts_uncertainty"] = doubts
     attrs |= {name: text for name in CARRIED if isinstance(text := (measured or {}).get(name), str) and text.strip()}
     if lever_axes:
         attrs["lever_axes"] = lever_axes

@@ -244,8 +244,9 @@ def _tidy(ds: xr.Dataset) -> xr.Dataset:
         ds = ds.assign({name: _text(variable) for name, variable in texts.items()}).set_coords(coords)
         ds = ds.drop_indexes([name for name in coords if name in ds.xindexes])
     ds.attrs = _tidy_attrs(ds.attrs)
-    if isinstance(notes := ds.attrs.get("notes"), str):  # a list of one sentence is read as a text
-        ds.attrs["notes"] = [notes]
+    for name in ("notes", "doubts_uncertainty"):
+        if isinstance(stated := ds.attrs.get(name), str):  # a list of one sentence is read as a text
+            ds.attrs[name] = [stated]
     for variable in ds.variables.values():
         variable.attrs = _tidy_attrs(variable.attrs)
     return ds

@@ -32,7 +32,7 @@ from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown
 
-__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned", "notes"]
+__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned", "doubts", "notes"]
 
 FALSE_ALARM = 1e-3
 """Probability of excluding anything from valid data."""
@@ -112,7 +112,7 @@ class Cleaned:
 
 
 def notes(found: Cleaned, what: str = "readings") -> list[str]:
-    """Return one sentence on what was excluded, and one on each contradiction that remains; none for valid data."""
+    """Return a sentence on what was excluded; none for valid data."""
     texts = []
     if found.made:
         shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in found.made[:SHOWN]]
@@ -120,6 +120,12 @@ def notes(found: Cleaned, what: str = "readings") -> list[str]:
         count = int(found.excluded.reshape(len(found.excluded), -1).any(axis=1).sum())
         done = f"{count} of them {'is' if count == 1 else 'are'} not used" if count else "their effect is estimated"
         texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {done}.")
+    return texts
+
+
+def doubts(found: Cleaned, what: str = "readings") -> list[str]:
+    """Return a sentence on each contradiction that remains, so that no uncertainty can be relied on."""
+    texts = []
     for each in found.undecided:
         if each.rivals:
             texts.append(

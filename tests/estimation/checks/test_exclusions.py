@@ -13,7 +13,7 @@ from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
 from errormotion.estimation.checks.candidates import Candidate, steps
 from errormotion.estimation.checks.effects import Numbers, information
-from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, notes
+from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, doubts, notes
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -315,8 +315,10 @@ def test_valid_data_have_no_note_and_others_one_sentence() -> None:
         "Some readings contradict the others (ball 2 before cycle 10); their effect is estimated."
     ]
     pair = np.array([[0.0, 0.3], [0.2, -0.1], [0.4, 20.0], [0.1, 0.2]])
-    text = notes(cleaned(levels(4, 2, pair)))
+    undecided = cleaned(levels(4, 2, pair))
+    text = doubts(undecided)
     assert len(text) == 1
+    assert notes(undecided) == []
     assert text[0].startswith("One of reading 5, reading 6 is wrong") or "reading 6, reading 5" in text[0]
 
 
