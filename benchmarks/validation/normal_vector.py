@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector, Settings, simulation
-from errormotion.methods.normal_vector.identification.bound import bound
 from errormotion.methods.normal_vector.identification.freedoms import Motion
 from errormotion.twin import Event, VirtualMachine
+
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
+from probing_bound import bound
 
 TITLE = "Balls touched by the machine"
 SEEDS = 300

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.normal_vector.schema import SCHEMA
 from errormotion.methods.normal_vector.settings import Settings as BallSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
@@ -14,16 +15,17 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
+    from errormotion.measurement import Observed
 
 
-class NormalVector:
+class NormalVector(ModelMethod):
     """Translation and rotation of the frame of the axes during warm-up, from balls touched by the machine itself."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="normal_vector",
         summary="Thermal error from balls on the table, touched by the machine's own probe while it warms up",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "a tilt of the spindle relative to the last axis: the tip keeps its position in the spindle, so that all "
             "balls appear displaced equally",
@@ -45,7 +47,6 @@ class NormalVector:
     simulate = lazy("errormotion.methods.normal_vector.simulation:simulate")
     truth = lazy("errormotion.methods.normal_vector.simulation:truth_of")
     conformance = lazy("errormotion.methods.normal_vector.conformance:subjects")
-    redrawing = lazy("errormotion.methods.normal_vector.redrawing:redrawing")
 
     def acquire(
         self,
@@ -107,10 +108,6 @@ class NormalVector:
         commanded = (["touch_probe"] if active else []) + (["controller"] if driven else [])
         return [text for kind in commanded for text in unarmed(bench, kind)]
 
-    def append_dim(self, settings: BallSettings) -> str:  # noqa: ARG002 - part of the protocol
-        """Return ``time``."""
-        return "time"
-
     def progress(self, settings: BallSettings) -> float:
         """Return the number of probing cycles, including the cold one."""
         from errormotion.methods.normal_vector.acquisition.cycle import cycles
@@ -122,6 +119,18 @@ class NormalVector:
         from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 
         return LiveBalls(settings).update
+
+    def observe(self, raw: xr.Dataset, settings: BallSettings) -> Observed:
+        """Return the touches as a problem of least squares; see ``model``."""
+        from errormotion.methods.normal_vector.result import observe
+
+        return observe(raw, settings)
+
+    def expected(self, settings: BallSettings) -> xr.Dataset:
+        """Return the touches of a machine without errors; see ``planning``."""
+        from errormotion.methods.normal_vector.planning import expected
+
+        return expected(settings)
 
     def identify(self, raw: xr.Dataset, settings: BallSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``tool`` over ``time``.
@@ -140,11 +149,9 @@ class NormalVector:
             The data do not determine the errors, or contradict the stated balls.
         """
         from errormotion.datasets.validation import checked_raw
-        from errormotion.methods.normal_vector.identification.identify import identify_motion
+        from errormotion.methods.normal_vector.result import identified
 
-        settings = settings or BallSettings()
-        checked = checked_raw(raw, self)
-        return identify_motion(checked, settings, self.info.id, self.info.version)
+        return identified(self, checked_raw(raw, self), settings or BallSettings())
 
     def planning_settings(self, settings: BallSettings, instruments: Mapping[str, Any]) -> BallSettings:
         """Return the settings with tip radius and noise of a touch of the probe on the bench, where they state none."""

@@ -183,6 +183,25 @@ def test_remarks_of_the_method_and_flags_of_the_probe_are_reported(folder):
     assert "The probe flagged no touch." in words(page(clean, folder))
 
 
+@pytest.mark.parametrize("variant", ["touches", "centres"])
+@pytest.mark.parametrize("noise", ["stated", "half", "unknown"])
+def test_notes_of_the_result_are_in_the_german_catalogue(variant, noise):
+    """Outliers, a moved ball with its rivals, missing readings, and every statement on the noise."""
+    raw = warm_up("cframe", balls=3, moved=(1, 3000.0, (4 * UM, -3 * UM, 3 * UM)), variant=variant)
+    raw = raw.copy(deep=True)
+    name, spread = ("touch", "touch_noise") if variant == "touches" else ("centre", "centre_covariance")
+    raw[name][(2, 0, 1) if variant == "touches" else (2, 0)] += 40 * UM
+    if noise == "unknown":
+        raw = raw.drop_vars(spread)
+    elif noise == "half":
+        raw[spread] = raw[spread] / 4
+    found = [NormalVector().identify(raw, NormalVector.Settings(noise=how)) for how in ("auto", "stated")]
+    german = Catalogue("de", [NormalVector.texts("de")])
+    for note in {note for errors in found for note in errors.attrs["notes"]}:
+        german(note)
+    assert not german.missing
+
+
 def test_centre_that_lost_its_top_touch_is_not_drawn_as_a_displacement():
     seen = probing(*clean())
     assert seen.well_known.all()

@@ -53,6 +53,12 @@ class Motion:
         lever = self.carries
         return (0, 1, 2, *(3 + k for k in range(3) if lever[[j for j in range(3) if j != k]].any()))
 
+    def full(self, values: Array) -> Array:
+        """Return twists (..., 6) from the errors that are determined, (..., p); 0 for the others."""
+        found = np.zeros((*values.shape[:-1], 6))
+        found[..., list(self.seen)] = values
+        return found
+
     def lever(self, position: Array) -> Array:
         """Return M (p - f) of positions (..., 3), m."""
         return (position - self.point) * self.carries

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.normal_vector.identification.rigid import Observations
+from errormotion.methods.normal_vector.identification.spheres import Observations
 from errormotion.methods.normal_vector.schema import flag_text
 
 if TYPE_CHECKING:
@@ -51,6 +51,11 @@ class Readings:
     nominal: Array | None
     radius: Array
     timed: bool
+
+    @property
+    def what(self) -> str:
+        """What was read."""
+        return "the touches" if self.seen.touched else "the centres"
 
 
 def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
@@ -106,6 +111,28 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
             f"The data state that {axes or 'no axis'} carries the tool; the setting {settings.tool_axes} was not used."
         )
     return Readings(seen, names, axes, noise, nominal, radius, timed)
+
+
+def coordinates(raw: xr.Dataset, data: Readings) -> dict[str, Any]:
+    """Return the coordinates of the result."""
+    coords: dict[str, Any] = {
+        "time": ("time", data.seen.cycle_time, {"units": "s"}),
+        "cycle_time": ("time", data.seen.cycle_time, {"units": "s", "long_name": "start of the probing cycle"}),
+        "ball": data.names,
+        "direction": list("xyz"),
+        "direction_": list("xyz"),
+    }
+    for name in ("temperature", "spindle_speed", "feed"):
+        if name in raw:
+            dims = ("time", "sensor") if name == "temperature" else ("time",)
+            coords[name] = (
+                dims,
+                np.array(raw[name].transpose(*dims).values, float),
+                {"units": raw[name].attrs["units"]},
+            )
+    if "sensor" in raw.coords and "temperature" in raw:
+        coords["sensor"] = [str(name) for name in raw["sensor"].values]
+    return coords
 
 
 def check_balls(centre: Array, radius: Array, data: Readings, tolerance: float) -> None:

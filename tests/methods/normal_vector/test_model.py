@@ -1,13 +1,19 @@
-"""The joint least squares: its solver against dense algebra, its covariance against the bound, its motions exact."""
+"""The measurement model: its derivatives, its covariance against the bound, its motions exact."""
+
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from probing_bound import bound
 
+from errormotion.estimation.fit import fit
+from errormotion.estimation.sources import Places, errors_of
 from errormotion.methods.normal_vector.acquisition.touching import touch_normals
-from errormotion.methods.normal_vector.identification import chain
-from errormotion.methods.normal_vector.identification.bound import bound
 from errormotion.methods.normal_vector.identification.freedoms import Motion, rotated, undetermined
-from errormotion.methods.normal_vector.identification.rigid import Observations, fit, knot_weights
+from errormotion.methods.normal_vector.identification.reading import Readings
+from errormotion.methods.normal_vector.identification.spheres import Observations
+from errormotion.methods.normal_vector.model import Probing, Unknowns, knot_weights
 
 BALLS = {
     "XYZ": np.array([(1.0, -0.5, 0.1), (3.0, -0.6, 0.3), (2.0, 0.6, 0.15), (1.5, 0.1, 0.6)]),
@@ -37,44 +43,72 @@ def touches(axes, cycles=5, count=5, noise=0.0, drift=DRIFT, seed=0, duration=10
         way -= np.linalg.norm(place + motion.error(true, motion.lever(place)) - ball[:, None], axis=-1) - reach
     place = ball[:, None] + (way + noise * rng.normal(size=way.shape))[..., None] * normal
     weight = np.zeros((*time.shape, count))
-    weight[..., range(count), range(count)] = NOISE**-2
+    weight[..., range(count), range(count)] = 1.0
     middle = time.mean(axis=(1, 2))
     share = (middle - middle[0]) / begin[-1]
     at_cycle = (share * (2 - share))[:, None] * drift
     return Observations(place, weight, time, begin, touched=True), motion, at_cycle
 
 
-@pytest.mark.parametrize("coupled", [False, True])
-def test_elimination_along_the_cycles_agrees_with_dense_algebra(coupled):
-    rng = np.random.default_rng(3)
-    n, p, q = 6, 4, 5
-    A = rng.normal(size=(80, n * p + q))
-    near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= (1 if coupled else 0)
-    N = A.T @ A
-    N[: n * p, : n * p] *= np.kron(near, np.ones((p, p)))
-    N += 100 * np.eye(len(N))
-    right = rng.normal(size=len(N))
-    blocks = N[: n * p, : n * p].reshape(n, p, n, p)
-    solved = chain.solve(
-        np.array([blocks[k, :, k] for k in range(n)]),
-        np.array([blocks[k, :, k + 1] for k in range(n - 1)]),
-        N[: n * p, n * p :].reshape(n, p, q),
-        N[n * p :, n * p :],
-        right[: n * p].reshape(n, p),
-        right[n * p :],
-    )
-    full, inverse = np.linalg.solve(N, right), np.linalg.inv(N)[: n * p, : n * p].reshape(n, p, n, p)
-    np.testing.assert_allclose(np.concatenate([solved.x.ravel(), solved.offset]), full, rtol=1e-10)
-    for k in range(n):
-        found = solved.own[k] + solved.shared[k] @ solved.shared[k].T
-        np.testing.assert_allclose(found, inverse[k, :, k], rtol=1e-9, atol=1e-12)
+def solved(seen, motion, interpolate=True):
+    """Return the solution of the model for touches, as twists of six errors with their covariance."""
+    names = [str(i + 1) for i in range(seen.valid.shape[1])]
+    data = Readings(seen, names, motion.tool_axes, NOISE, None, np.full(len(names), np.nan), timed=True)
+    probing = Probing(data, motion, interpolate)
+    found = fit(probing.determined(probing.problem()), refresh=probing.refreshed)
+    errors = errors_of(found, Places(lambda x, _: x.twist, len(seen.cycle_time)), shared="cold reference")
+    rows = np.array(motion.seen)
+    shared = np.einsum("skp,skq->kpq", errors.influence, errors.influence)
+    whole = np.zeros((3, len(errors.value), 6, 6))
+    for full, part in zip(whole, (errors.covariance, errors.own, shared), strict=True):
+        full[:, rows[:, None], rows] = part
+    twist = motion.full(found.unknowns.twist)
+    return SimpleNamespace(
+        fit=found, twist=twist, covariance=whole[0], own=whole[1], shared=whole[2], anchor=found.constants.centre,
+        time=seen.mean_time, chi2=found.chi2, freedom=found.freedom,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("axes", ["XYZ", "Z"])
+@pytest.mark.parametrize("touched", [True, False])
+def test_derivatives_of_the_model_are_those_of_its_equation(axes, touched):
+    seen, motion, _ = touches(axes)
+    if not touched:
+        weight = np.broadcast_to(np.eye(3), (*seen.weight.shape[:2], 3, 3)).copy()
+        centre = np.broadcast_to(BALLS[axes][:, None], (*weight.shape[:2], 3, 3)).copy()
+        seen = Observations(centre, weight, seen.time[..., :3], seen.cycle_time, touched=False)
+    data = Readings(seen, list("1234"), axes, NOISE, None, np.full(4, np.nan), timed=touched)
+    problem = Probing(data, motion, interpolate=touched).problem()
+    twist = np.tile(DRIFT[list(motion.seen)] * 1e-3, (len(problem.y), 1))  # the turn of a step is of second order
+    rows = [twist, problem.unknowns.reach.rows(problem.unknowns.reach.start)]
+    c = problem.named(rows, [each.rows(each.value) for each in problem.constants])[1]
+    analytic = problem.derivatives(problem.y, Unknowns(*rows), c)
+    for k, name in enumerate(Unknowns._fields):
+        for col in range(rows[k].shape[1]):
+            ends = []
+            for sign in (1, -1):
+                moved = [each.copy() for each in rows]
+                moved[k][:, col] += sign * 1e-6
+                ends.append(problem.equation(problem.y, Unknowns(*moved), c).reshape(len(problem.y), -1))
+            np.testing.assert_allclose(analytic[name][..., col], (ends[0] - ends[1]) / 2e-6, atol=2e-7)
+
+
+def test_analytic_derivative_by_the_readings_is_that_of_the_differences():
+    seen, motion, _ = touches("XYZ", noise=NOISE)
+    with_it = solved(seen, motion)
+    problem = with_it.fit.problem
+    without = replace(problem, derivatives=lambda *at: {
+        name: J for name, J in problem.derivatives(*at).items() if name != "readings"
+    })  # fmt: skip
+    np.testing.assert_allclose(fit(without).unknowns.twist, with_it.fit.unknowns.twist, atol=1e-12)
+    np.testing.assert_allclose(fit(without).chi2, with_it.chi2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("axes", ["XYZ", "Z", "YZ"])
 @pytest.mark.parametrize("uneven", [0.0, 1.5e-6])
 def test_motion_is_exact_without_noise_for_any_reaches(axes, uneven):
     seen, motion, true = touches(axes, uneven=uneven, duration=0.0)
-    found = fit(seen, motion)
+    found = solved(seen, motion)
     rows = list(motion.seen)
     # Spheres through uneven reaches have their centres off by some of it: normals are off by 1e-4 at most, and so is
     # what they show of 50 um; turns have levers of 0.1 m on a C-frame.
@@ -88,7 +122,7 @@ def test_rotation_of_a_milliradian_is_exact():
     drift = np.array([0, 0, 0, 1e-3, -0.7e-3, 0.5e-3])
     seen, motion, true = touches("XYZ", drift=drift, duration=0.0, uneven=0.0)
     # To first order the balls would be off by the square of the angle times 1 m: 1 um.
-    np.testing.assert_allclose(fit(seen, motion).twist, true, atol=1e-10)
+    np.testing.assert_allclose(solved(seen, motion).twist, true, atol=1e-10)
 
 
 def test_rotation_preserves_lengths():
@@ -103,7 +137,7 @@ def test_rotation_preserves_lengths():
 @pytest.mark.parametrize("interpolate", [True, False])
 def test_stated_covariance_is_the_bound(axes, interpolate):
     seen, motion, _ = touches(axes, noise=NOISE)
-    found = fit(seen, motion, interpolate=interpolate)
+    found = solved(seen, motion, interpolate=interpolate)
     normal = np.tile(touch_normals(5), (4, 1, 1))
     times = {"time": found.time, "touch_time": seen.time} if interpolate else {"cycles": 5}
     least = bound(BALLS[axes][:, None] + REACH * normal, normal, motion, noise=NOISE, **times)
@@ -122,16 +156,15 @@ def test_unknown_reach_of_each_touch_costs_no_more_than_one_radius_for_each_ball
 
 def test_half_of_the_variance_is_the_cold_cycles():
     seen, motion, _ = touches("XYZ", noise=NOISE)
-    found = fit(seen, motion, interpolate=False)
-    shared = found.shared[1:] @ np.swapaxes(found.shared[1:], 1, 2)
-    np.testing.assert_allclose(np.einsum("kii->ki", shared), np.einsum("kii->ki", found.own[1:]), rtol=1e-3)
+    found = solved(seen, motion, interpolate=False)
+    np.testing.assert_allclose(np.einsum("kii->ki", found.shared[1:]), np.einsum("kii->ki", found.own[1:]), rtol=1e-3)
 
 
 def test_errors_are_as_large_as_their_covariance_says():
     total, freedoms, chi2, freedom = 0.0, 0, 0.0, 0
     for seed in range(60):
         seen, motion, true = touches("XYZ", noise=NOISE, seed=seed, drift=0.2 * DRIFT)
-        found = fit(seen, motion)
+        found = solved(seen, motion)
         error = found.twist[2] - true[2]
         total += error @ np.linalg.solve(found.covariance[2], error)
         chi2, freedom, freedoms = chi2 + found.chi2, freedom + found.freedom, freedoms + 6
@@ -142,7 +175,7 @@ def test_errors_are_as_large_as_their_covariance_says():
 
 def test_drift_within_a_cycle_would_smear_where_it_is_not_followed():
     seen, motion, true = touches("XYZ", duration=300.0, uneven=0.0)
-    followed, not_followed = (fit(seen, motion, interpolate=way).twist[2] - true[2] for way in (True, False))
+    followed, not_followed = (solved(seen, motion, interpolate=way).twist[2] - true[2] for way in (True, False))
     assert np.abs(not_followed[3:]).max() > 1e-6
     # Only the last cycle's drift is not known, and what it says of its neighbours' touches.
     assert np.abs(followed).max() < 1e-2 * np.abs(not_followed).max()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.normal_vector.identification.rigid import knot_weights
+from errormotion.methods.normal_vector.model import knot_weights
 
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.identification.freedoms import Motion

@@ -1,0 +1,113 @@
+"""Touches that contradict the stated axes of the tool, and agree with others.
+
+With wrong axes, balls at rest seem to move, one after the other; without these balls the remaining touches fit, and
+their uncertainty is that of the noise alone. A ball that has really moved is explained by no other axes, unless there
+are only three balls.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from scipy import special
+
+from errormotion.errors import FitError, MethodError
+from errormotion.estimation.checks.exclusions import FALSE_ALARM
+from errormotion.estimation.fit import Fit
+from errormotion.methods.normal_vector.identification.freedoms import Motion, undetermined
+from errormotion.methods.normal_vector.identification.reading import AXES
+
+if TYPE_CHECKING:
+    from errormotion.estimation.checks.exclusions import Cleaned
+    from errormotion.estimation.problem import Problem
+    from errormotion.measurement.identification import Solved
+    from errormotion.methods.normal_vector.model import Probing
+
+ODDS = 12.0
+"""Difference in chi-square from which one explanation is more probable than another: odds of 400 to 1."""
+
+
+def contradiction(solved: Solved, probing: Probing, smallest_move: float) -> str:
+    """Return a note if the touches may contradict the axes that carry the tool; "" if they do not.
+
+    Raises
+    ------
+    MethodError
+        They contradict these axes, and all of them agree with others.
+    """
+    found = agreeing_axes(solved, probing, smallest_move)
+    if not found or solved.cleaned is None:
+        return ""
+    stated, other = probing.motion.tool_axes or "none", " or ".join(axes or "none" for axes in found)
+    if len(solved.cleaned.made) == 1 and probing.usable(solved.fit.problem).all():
+        return (
+            f"All touches would agree without any exclusion if other axes carried the tool: {other} instead of "
+            f"{stated} (tool_axes). Check the machine."
+        )
+    raise MethodError(
+        f"The touches contradict tool_axes = {stated}, the axes that carry the tool: balls seem to move, or touches "
+        f"scatter. All of them agree with {other}. State the axes that carry the tool (attribute tool_axes of the "
+        "data, which has priority, or the setting)."
+    )
+
+
+def agreeing_axes(solved: Solved, probing: Probing, smallest_move: float) -> list[str]:
+    """Return other axes of the tool with which all touches agree, the best first, if they do not with the stated ones.
+
+    Parameters
+    ----------
+    solved : Solved
+        With the stated axes; what was excluded tells whether the touches agree with them.
+    probing : Probing
+    smallest_move : float
+        Of a ball, m.
+    """
+    if solved.cleaned is None:
+        return []
+    stated, problem = solved.given.noise.stated, solved.given
+    if stated and agrees(solved.cleaned, probing):
+        return []
+    anchor = solved.fit.constants.centre if probing.data.seen.touched else solved.fit.unknowns.reach
+    found: list[tuple[float, str]] = []
+    for axes in AXES:
+        other = replace(probing, motion=Motion(axes, probing.motion.point))
+        if axes == probing.motion.tool_axes or undetermined(anchor, other.motion):
+            continue
+        try:
+            gain, further = _gain(probing, other, problem)
+            if gain <= ODDS + (special.chdtri(further, FALSE_ALARM) if further else 0.0):
+                continue
+            if agrees(other.cleaned(smallest_move), other):
+                found.append((-gain, axes))
+        except FitError:
+            continue
+    return [axes for _, axes in sorted(found)]
+
+
+def agrees(cleaned: Cleaned, probing: Probing) -> bool:
+    """Return whether nothing was excluded, and the touches scatter as stated."""
+    return (
+        not (cleaned.made or cleaned.undecided)
+        and bool(probing.usable(cleaned.fit.problem).all())
+        and _scatter_as_stated(cleaned.fit)
+    )
+
+
+def _gain(probing: Probing, other: Probing, problem: Problem) -> tuple[float, int]:
+    """Return the decrease of chi-square by other axes, and the number of their further unknowns.
+
+    Both explain the cycles that determine the motion with either. Without a stated noise its variance is that of all
+    touches with the other axes.
+    """
+    whole = other.fitted(other.problem())
+    variance = 1.0 if problem.noise.stated else whole.chi2 / max(whole.freedom, 1)
+    both = probing.usable(problem) & other.usable(whole.problem)
+    own, its = (each.fitted(each.problem(), both) for each in (probing, other))
+    further = max(len(other.motion.seen) - len(probing.motion.seen), 0) * int(both.sum())
+    return (own.chi2 - its.chi2) / variance, further
+
+
+def _scatter_as_stated(found: Fit) -> bool:
+    stated = found.problem.noise.stated
+    return not (stated and found.freedom > 0 and found.chi2 > special.chdtri(found.freedom, FALSE_ALARM))

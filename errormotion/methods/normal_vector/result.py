@@ -1,0 +1,335 @@
+"""What the result says besides the errors: centres, displacements and residuals, exclusions, the published normals."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets import provenance
+from errormotion.errors import MethodError
+from errormotion.estimation.checks import exclusions
+from errormotion.estimation.checks.exclusions import Exclusion
+from errormotion.estimation.sources import Errors, Source
+from errormotion.estimation.variance import expansion
+from errormotion.measurement import ModelMethod, Observed
+from errormotion.measurement.identification import Solved, dataset, solve
+from errormotion.methods.normal_vector import model
+from errormotion.methods.normal_vector.contradiction import contradiction
+from errormotion.methods.normal_vector.identification import normals
+from errormotion.methods.normal_vector.identification.spheres import Centres, Observations, centres
+from errormotion.methods.normal_vector.model import COLD, Probing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from errormotion.methods.normal_vector.identification.reading import Readings
+    from errormotion.methods.normal_vector.settings import Settings
+
+log = logging.getLogger(__name__)
+
+MIN_SOURCE = 1e-4
+"""Smallest variance of a common source, relative to the largest one, that is stated separately."""
+SHOWN = 8
+"""Unknown cycles that are named."""
+
+
+@dataclass(frozen=True)
+class Excluded:
+    """What the search for outliers excluded.
+
+    Attributes
+    ----------
+    wrong : ndarray of bool (k, b, m)
+        Outliers.
+    moves : list of (Exclusion, int, int)
+        Balls that moved: what was found, the ball, and the first cycle after the move.
+    lost : ndarray of int
+        Cycles that do not determine the motion.
+    undecided : sequence of Exclusion
+        Contradictions that remain.
+    """
+
+    wrong: NDArray[np.bool_]
+    moves: list[tuple[Exclusion, int, int]]
+    lost: NDArray[np.intp]
+    undecided: Sequence[Exclusion]
+
+    @classmethod
+    def of(cls, solved: Solved, probing: Probing) -> Excluded:
+        """Return what was excluded from a solution."""
+        k, b, m = probing.shape
+        wrong = np.zeros((k, b, m), dtype=bool)
+        moves = []
+        names = {probing.moved(ball, cycle): (ball, cycle) for ball in range(b) for cycle in range(k)}
+        search = solved.cleaned
+        for each in () if search is None else search.made:
+            if each.words in names:
+                moves.append((each, *names[each.words]))
+            else:
+                wrong |= each.readings.any(axis=1).reshape(k, b, -1)
+        lost = np.flatnonzero(~probing.usable(solved.fit.problem))
+        return cls(wrong, moves, lost, () if search is None else search.undecided)
+
+
+def identified(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
+    """Return the error dataset of raw data that follow their schema.
+
+    Raises
+    ------
+    MethodError
+        The data do not determine the motion, or contradict the stated balls.
+    """
+    solved = solve(method.observe(raw, settings))
+    steps = ["joint least squares of all touches"]
+    if settings.procedure == "normals":
+        steps = ["normals of two planes through four balls, Cayley"]
+    if solved.cleaned is not None:
+        steps += [f"excluded: {each.words}" for each in solved.cleaned.made]
+    for note in solved.observed.notes:
+        log.warning(note)
+    found = dataset(method, solved, raw, method.info, provenance.make(settings, raw, None, steps=steps))
+    return found.assign_attrs(tool_axes=str(raw.attrs.get("tool_axes", settings.tool_axes)))
+
+
+def observe(raw: xr.Dataset, settings: Settings) -> Observed:
+    """Return the model of raw data, with what its solution says besides the errors; see `model.observe`."""
+    observed, probing = model.observe(raw, settings)
+    return replace(observed, finish=lambda solved: finished(solved, probing, settings, observed.notes))
+
+
+def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequence[str]) -> Solved:
+    """Return a solution with times, notes and further variables; with ``procedure = normals`` with their errors.
+
+    Raises
+    ------
+    MethodError
+        The normals are not determined, and are wanted.
+    """
+    data, problem, fit = probing.data, solved.fit.problem, solved.fit
+    seen, excluded = probing.seen(problem), Excluded.of(solved, probing)
+    noise = data.noise if np.isfinite(data.noise) else 1.0
+    noise *= float(np.sqrt(solved.scatter.factor) * expansion(solved.scatter.freedom))
+    anchor = fit.constants.centre if seen.touched else fit.unknowns.reach
+    measured_reach = problem.unknowns.reach.freed
+    reach = np.where(measured_reach, fit.unknowns.reach, np.nan).reshape(len(data.names), -1)
+    best = _compressed(solved.relative.errors, excluded.lost)
+    other, why = _published(probing, solved, seen, excluded, anchor, reach, settings, noise)
+    if settings.procedure == "normals" and other is None:
+        raise MethodError("procedure = normals: " + why)
+    chosen = best if other is None or settings.procedure == "rigid" else other
+    time = _times(probing, seen, excluded)
+    axes = contradiction(solved, probing, settings.smallest_move)
+    texts = [*notes, axes, solved.scatter.note, *_exclusions(solved, excluded, data), why]
+    observed = replace(
+        solved.observed,
+        coords=dict(solved.observed.coords) | {"time": ("time", time, {"units": "s"})},
+        notes=[text for text in texts if text],
+        extras=_extras(
+            probing, solved, excluded, centres(_every(probing, seen, excluded), anchor, reach), noise, best, other
+        ),
+        attributes=dict(solved.observed.attributes)
+        | {
+            "reference_sources": [source.name for source in chosen.sources],
+            "reference_interval": (float(time[0]), float(time[0])),
+        },
+    )
+    return replace(
+        solved,
+        observed=observed,
+        scatter=replace(solved.scatter, note=""),
+        relative=replace(solved.relative, errors=chosen),
+    )
+
+
+def _compressed(errors: Errors, lost: NDArray[np.intp]) -> Errors:
+    """Return errors with a few independent sources in place of all that are common, and NaN for lost cycles."""
+    shared, C = np.moveaxis(errors.influence, 0, 2), errors.covariance
+    u = np.sqrt(np.einsum("kii->ki", C))
+    F = np.where(u[..., None] > 0, shared / np.where(u > 0, u, 1.0)[..., None], 0.0)
+    F = np.nan_to_num(F).reshape(-1, shared.shape[2])
+    values, vectors = np.linalg.eigh(F.T @ F)
+    shared = shared @ vectors[:, values > MIN_SOURCE * max(values[-1], 1e-300)][:, ::-1]
+    value, own = errors.value.copy(), C - shared @ np.swapaxes(shared, 1, 2)
+    for array in (value, own, shared):
+        array[lost] = np.nan
+    return Errors(value, own, [Source(f"{COLD} {i + 1}", COLD, shared[..., i]) for i in range(shared.shape[2])])
+
+
+def _published(
+    probing: Probing,
+    solved: Solved,
+    seen: Observations,
+    excluded: Excluded,
+    anchor: Array,
+    reach: Array,
+    settings: Settings,
+    noise: float,
+) -> tuple[Errors | None, str]:
+    """Return the result of the published construction from four balls; None, and why, if it is not applicable."""
+    data, motion = probing.data, probing.motion
+    if motion.tool_axes != "XYZ":
+        return None, (
+            "The normals of planes through balls are not applicable: where axes carry the workpiece, a rotation of "
+            "their frame shears the apparent arrangement of the balls instead of rotating it."
+        )
+    if len(data.names) < 4:
+        return None, f"The normals of two planes need four balls; found {len(data.names)}."
+    four = normals.chosen(data.names, settings.normals_balls)
+    simultaneous = centres(_at_cycle_time(probing, solved, seen), anchor, reach)
+    centre, cofactor = simultaneous.centre[:, four].copy(), noise**2 * simultaneous.cofactor[:, four]
+    for _, ball, cycle in excluded.moves:
+        if ball in four:
+            centre[cycle:] = np.nan
+    known = np.all(np.isfinite(centre), axis=(1, 2))
+    if not known[0]:
+        return None, "The normals are unknown: one of their balls is missing in the cold cycle."
+    if not normals.planes_apart(centre[0]):
+        return None, normals.ONE_PLANE
+    k = len(centre)
+    twist, own, shared = np.full((k, 6), np.nan), np.full((k, 6, 6), np.nan), np.full((k, 6, 12), np.nan)
+    twist[known] = normals.twist(centre[0], centre[known], motion.point)
+    total = normals.covariance(cofactor[0], cofactor[known], motion.point, centre[0])
+    cold = normals.jacobian(centre[0], motion.point)
+    shared[known] = np.einsum("ubi,bij->ubj", cold, np.linalg.cholesky(cofactor[0])).reshape(6, 12)
+    own[known] = total - shared[known] @ np.swapaxes(shared[known], 1, 2)
+    for array in (own, shared):
+        array[0] = 0.0
+    sources = [Source("", "", shared[..., i]) for i in range(shared.shape[2])]
+    return _compressed(Errors(twist, own, sources), np.flatnonzero(~known)), ""
+
+
+def _at_cycle_time(probing: Probing, solved: Solved, seen: Observations) -> Observations:
+    """Return the touches corrected for the drift within each cycle, as if made simultaneously."""
+    if not probing.interpolate or not seen.touched:
+        return seen
+    motion, twist = probing.motion, solved.fit.unknowns.twist
+    lever = motion.lever(seen.position)
+    at_touch = solved.fit.problem.unknowns.twist.rows(twist).reshape(*seen.time.shape, -1)
+    drift = motion.error(motion.full(at_touch), lever) - motion.error(motion.full(twist)[:, None, None], lever)
+    return replace(seen, position=seen.position + np.where(seen.valid[..., None], drift, 0.0))
+
+
+def _every(probing: Probing, seen: Observations, excluded: Excluded) -> Observations:
+    """Return all readings but outliers: those of balls that moved show where they are."""
+    every = probing.data.seen.without(excluded.wrong)
+    return replace(every, position=np.where(seen.valid[..., None], seen.position, every.position))
+
+
+def _times(probing: Probing, seen: Observations, excluded: Excluded) -> Array:
+    """Return the time of each cycle: the mean of its valid touches if these have times, else its start."""
+    every = probing.data.seen
+    time = every.cycle_time.copy()
+    if not probing.data.timed:
+        return time
+    known = every.valid.any(axis=(1, 2))
+    time[known] = every.mean_time[known]
+    if probing.interpolate:
+        used = np.setdiff1d(np.arange(len(time)), excluded.lost)
+        time[used] = seen.mean_time[used]
+    return time
+
+
+def _exclusions(solved: Solved, excluded: Excluded, data: Readings) -> list[str]:
+    """Return notes on outliers, balls that moved, and cycles without a result."""
+    notes: list[str] = []
+    wrong = excluded.wrong if data.seen.touched else excluded.wrong.any(axis=2)
+    if wrong.any():
+        count = int(wrong.sum())
+        k, i = (int(index) for index in np.argwhere(wrong)[0][:2])
+        what = data.what.removeprefix("the ")
+        notes.append(
+            f"{count} outliers among the {what} were excluded, the first of ball {data.names[i]} in cycle {k}."
+        )
+    for move, _, _ in excluded.moves:
+        shift = ", ".join(f"{value * 1e6:.2g}" for value in move.size)
+        others = [words for words in move.rivals if words not in [each.words for each, _, _ in excluded.moves]]
+        also = f" It may also be that {' or '.join(others)}." if others else ""
+        notes.append(
+            f"{move.words[:1].upper()}{move.words[1:]}, by about ({shift}) um as measured; excluded from this cycle "
+            f"on.{also}"
+        )
+    if len(excluded.moves) > 1:
+        notes.append(
+            "More than one ball appears to have moved. Check their mounting and the axes that carry the tool "
+            "(tool_axes). A machine that does not move as one rigid frame has the same effect."
+        )
+    if solved.cleaned is not None:
+        notes += exclusions.notes(replace(solved.cleaned, made=()), data.what.removeprefix("the "))
+    lost = excluded.lost
+    if lost.size:
+        shown = ", ".join(map(str, lost[:SHOWN])) + (f" and {lost.size - SHOWN} more" if lost.size > SHOWN else "")
+        notes.append(f"{lost.size} cycles do not determine the motion and are unknown: {shown}.")
+    return notes
+
+
+def _extras(
+    probing: Probing,
+    solved: Solved,
+    excluded: Excluded,
+    measured: Centres,
+    noise: float,
+    best: Errors,
+    other: Errors | None,
+) -> dict[str, xr.DataArray]:
+    """Return the further variables of the result."""
+    k, b, m = probing.shape
+    valid = probing.data.seen.valid
+    metre = {"units": "m"}
+    each = ("time", "ball", "touch" if probing.data.seen.touched else "direction")
+    flag = np.where(valid, 0, 1)
+    moved = np.zeros((k, b), dtype=np.int8)
+    for _, ball, cycle in excluded.moves:
+        moved[cycle:, ball] = 1
+    flag[(moved[..., None] > 0) & (flag == 0)] = 3
+    flag[excluded.wrong & valid] = 2
+    flag[excluded.lost] = np.where(flag[excluded.lost] == 0, 4, flag[excluded.lost])
+    dof = ("time", "dof")
+    plain, C, loss = np.full((k, 6), np.nan), np.full((k, 6, 6), np.nan), np.full((k, 6), np.nan)
+    if other is not None:
+        plain, C = other.value, other.covariance
+        u, u_best = (np.sqrt(np.einsum("kii->ki", each.covariance)) for each in (other, best))
+        loss = np.where(u_best > 0, u / np.where(u_best > 0, u_best, 1.0), np.nan)
+    extras = {
+        "centre": (
+            ("time", "ball", "direction"),
+            measured.centre,
+            {**metre, "long_name": "apparent centre in machine coordinates"},
+        ),
+        "centre_covariance": (
+            ("time", "ball", "direction", "direction_"),
+            noise**2 * measured.cofactor,
+            {"units": "m^2", "long_name": "from the touches of the cycle itself"},
+        ),
+        "ball_displacement": (
+            ("time", "ball", "direction"),
+            measured.centre - measured.centre[0],
+            {**metre, "long_name": "apparent, since the cold cycle: opposite to the error"},
+        ),
+        "residual": (
+            each,
+            solved.fit.residual.reshape(k, b, m),
+            {**metre, "long_name": "measured minus fitted distance"},
+        ),
+        "left_out": (
+            each,
+            flag.astype(np.int8),
+            {"long_name": "0 = used, 1 = missing, 2 = outlier, 3 = ball had moved, 4 = cycle not determined"},
+        ),
+        "ball_moved": (("time", "ball"), moved, {"long_name": "1 from the first cycle after a move of the ball"}),
+        "normals_errors": (dof, plain, {"long_name": "by the normals of two planes; m, rad"}),
+        "normals_covariance": ((*dof, "dof_"), C, {"long_name": "m^2, m rad, rad^2"}),
+        "normals_loss": (
+            dof,
+            loss,
+            {"units": "1", "long_name": "standard uncertainty by the normals over that by all touches"},
+        ),
+        "noise": ((), noise, metre),
+    }
+    return {name: xr.DataArray(array, dims=dims, attrs=attrs) for name, (dims, array, attrs) in extras.items()}
