@@ -107,18 +107,24 @@ def relative(errors: Errors, datum: Datum) -> Relative:
 
 
 def _exact(own: Array, A: Array, H: Array, weighted: Index, group: str) -> tuple[Array, list[Source], Array]:
-    """Return the independent part without the places that define the datum, and these as sources with their effect."""
+    """Return the independent part without that of the places which define the datum, and this as sources.
+
+    What does not change h, such as the errors of freedoms that the datum does not relate, stays independent.
+    """
     rest, added, of_h = own.copy(), list[Source](), list[Array]()
     for place in weighted:
         root = _root(own[place])
+        rest[place] = 0.0
         for k in range(root.shape[1]):
             change = H[place] @ root[:, k]
+            if not change.any():
+                rest[place] += np.outer(root[:, k], root[:, k])
+                continue
             effect = -np.einsum("pdg,g->pd", A, change)
             effect[place] += root[:, k]
             if np.abs(effect).max() > 1e-9 * np.abs(root).max():
                 added.append(Source(f"{group} {len(added) + 1}", group, effect))
                 of_h.append(change)
-        rest[place] = 0.0
     return rest, added, np.array(of_h).reshape(-1, A.shape[2])
 
 

@@ -86,7 +86,7 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     measured = raw.assign({name: xr.DataArray(values, dims=dims, attrs=raw[name].attrs).transpose(*order)})
     truth = dataset(model, exact, raw, info, provenance.make(settings, None, None, steps=["simulation"], seed=seed))
     zero = truth.copy()
-    for key in ("covariance", "influence"):
+    for key in ("covariance", "influence", "deviation_variance", "deviation_influence"):
         if key in zero:
             zero[key] = zero[key].copy(data=np.where(np.isfinite(zero[key].values), 0.0, np.nan))
     return measured.assign_attrs(machine="simulated"), zero.assign_attrs(machine="simulated")

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_errors, provenance
+from errormotion.datasets import build_deviations, build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
 from errormotion.estimation.checks import exclusions
@@ -196,43 +196,51 @@ def dataset(
     model: Model, solved: Solved, raw: xr.Dataset, info: MethodInfo, origin: Any, *, planned: bool = False
 ) -> xr.Dataset:
     """Return the error dataset of a solution; with ``planned`` its values are 0 where they are known."""
-    observed, errors = solved.observed, solved.relative.errors
-    shape = tuple(_size(observed, dim) for dim in observed.dims)
-    value = np.where(np.isfinite(errors.value), 0.0, np.nan) if planned else errors.value
-    names = _unique([source.name for source in errors.sources])
-    notes, doubts = [*observed.notes], [*observed.doubts]
-    if not planned:
-        (doubts if solved.scatter.doubtful else notes).append(solved.scatter.note)
-    datum = solved.relative
+    observed, datum = solved.observed, solved.relative
+    shape = _shape(observed)
+    notes = [*observed.notes, solved.scatter.note] if not planned else [*observed.notes]
     if planned:
-        datum = replace(datum, coefficient=np.zeros_like(datum.coefficient))
-    extras = dict(observed.extras) | _of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum))
-    return build_errors(
-        _placed(value, observed, shape),
-        _square(errors.covariance, observed, shape),
-        dims=observed.dims,
-        coords=observed.coords,
-        component=observed.component,
-        machine="plan" if planned else str(raw.attrs.get("machine", "unknown")),
-        frame=observed.frame,
-        functional_point=np.asarray(observed.functional_point, dtype=float),
-        reference=f"{observed.reference} (planned, not measured)" if planned else observed.reference,
-        method=info.id,
-        method_version=info.version,
-        provenance=origin,
-        influence=np.array([_placed(source.effect, observed, shape) for source in errors.sources]).reshape(
-            len(names), *shape, 6
-        ),
-        sources=names,
-        source_groups=[source.group for source in errors.sources],
-        source_ids={name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
-        extras=extras,
-        notes=notes,
-        doubts=doubts,
-        start="" if planned else start_of(raw),
-        measured=None if planned else raw.attrs,
+        zero = np.where(np.isfinite(datum.errors.value), 0.0, np.nan)
+        datum = replace(datum, errors=replace(datum.errors, value=zero), coefficient=0.0 * datum.coefficient)
+    errors = datum.errors
+    names = _unique([source.name for source in errors.sources])
+    common: dict[str, Any] = {
+        "dims": observed.dims,
+        "coords": observed.coords,
+        "component": observed.component,
+        "machine": "plan" if planned else str(raw.attrs.get("machine", "unknown")),
+        "frame": observed.frame,
+        "functional_point": np.asarray(observed.functional_point, dtype=float),
+        "reference": f"{observed.reference} (planned, not measured)" if planned else observed.reference,
+        "method": info.id,
+        "method_version": info.version,
+        "provenance": origin,
+        "sources": names,
+        "source_groups": [source.group for source in errors.sources],
+        "source_ids": {name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
+        "extras": dict(observed.extras) | _of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum)),
+        "start": "" if planned else start_of(raw),
+        "measured": None if planned else raw.attrs,
         **observed.attributes,
-    )
+    }
+    if observed.sensitivity is not None:
+        found = build_deviations(
+            errors.value[:, 0].reshape(shape),
+            errors.covariance[:, 0, 0].reshape(shape),
+            observed.sensitivity.reshape(*shape, 6),
+            influence=errors.influence.reshape(len(names), *shape),
+            **common,
+        )
+    else:
+        found = build_errors(
+            _placed(errors.value, observed, shape),
+            _square(errors.covariance, observed, shape),
+            influence=np.array([_placed(source.effect, observed, shape) for source in errors.sources]).reshape(
+                len(names), *shape, 6
+            ),
+            **common,
+        )
+    return found.assign_attrs(notes=[note for note in notes if note] or [""])
 
 
 def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
@@ -260,12 +268,14 @@ def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     }
 
 
-def _size(observed: Observed, dim: str) -> int:
-    """Return the size of a dim of the result, from its coordinate or the number of places."""
-    value = observed.coords.get(dim)
-    if value is None:
-        return observed.places.count
-    return len(value[1]) if isinstance(value, tuple) else len(value)
+def _shape(observed: Observed) -> tuple[int, ...]:
+    """Return the sizes of the dims of the result, from their coordinates; one without has the rest of the places."""
+    sizes = []
+    for dim in observed.dims:
+        value = observed.coords.get(dim)
+        sizes.append(0 if value is None else len(value[1]) if isinstance(value, tuple) else len(value))
+    rest = observed.places.count // max(int(np.prod([size for size in sizes if size])), 1)
+    return tuple(size or rest for size in sizes)
 
 
 def _placed(values: Array, observed: Observed, shape: tuple[int, ...]) -> Array:

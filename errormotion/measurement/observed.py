@@ -11,6 +11,7 @@ from errormotion.kinematics.iso import DOF
 if TYPE_CHECKING:
     import xarray as xr
 
+    from errormotion.arrays import Array
     from errormotion.estimation.blocks import Index
     from errormotion.estimation.checks.candidates import Candidate
     from errormotion.estimation.checks.exclusions import Cleaned
@@ -36,7 +37,7 @@ class Observed:
     freedoms : sequence of str, (d,)
         What the d errors are, among EX EY EZ EA EB EC.
     dims : sequence of str
-        Of the result; the places are in their order. Empty for one place.
+        Of the result; the places are in their order. Empty for one place. One of them may have no coordinate.
     coords : mapping
         As for `errormotion.datasets.build_errors`: name to array, or to (dims, array, attributes).
     component, reference, frame : str
@@ -45,6 +46,9 @@ class Observed:
         m.
     datum : Datum, optional
         What the errors are relative to; without one they are as the equation states them.
+    sensitivity : ndarray, (place, 6), optional
+        For errors along one known direction only: d = 1, and the effect of one unit of each freedom on it. The result
+        has them as ``deviation`` (`errormotion.datasets.build_deviations`).
     recorded : tuple of str, and its dims
         The variable of the raw data that the readings are, and the dims in the order of the readings. With it, the
         framework simulates raw data.
@@ -97,6 +101,7 @@ class Observed:
     freedoms: Sequence[str] = DOF
     frame: str = "machine"
     datum: Datum | None = None
+    sensitivity: Array | None = None
     recorded: tuple[str, tuple[str, ...]] | None = None
     shared: str = "readings"
     what: str = "the readings"

@@ -172,6 +172,21 @@ def test_a_line_through_the_ends_is_exact() -> None:
     assert result.errors.covariance[[0, -1]] == pytest.approx(np.zeros((2, 1, 1)), abs=1e-20)
 
 
+def test_what_a_datum_does_not_relate_stays_independent() -> None:
+    """A straightness is relative to the line through its ends; the positioning at the same targets is not."""
+    own = np.tile(np.diag([4.0, 9.0]), (5, 1, 1))
+    columns = np.zeros((5, 2, 2))
+    columns[:, 1] = np.stack([1.0 - np.linspace(0.0, 1.0, 5), np.linspace(0.0, 1.0, 5)], axis=1)
+    weight = np.zeros((5, 2))
+    weight[[0, 4], 1] = 1.0
+    found = relative(Errors(np.ones((5, 2)), own, []), Datum(columns, weight, "ends")).errors
+    assert found.own[:, 0, 0] == pytest.approx(np.full(5, 4.0))
+    assert found.own[[0, 4], 1, 1] == pytest.approx(np.zeros(2))
+    assert len(found.sources) == 2
+    assert np.abs(found.influence[..., 0]).max() == 0.0
+    assert found.covariance[2, 1, 1] == pytest.approx(9.0 * (1 + 0.5))
+
+
 def test_a_datum_of_many_places_has_exact_totals() -> None:
     rng = np.random.default_rng(6)
     n = 200

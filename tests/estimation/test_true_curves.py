@@ -84,3 +84,6 @@ def test_components_are_drawn_if_they_are_significant() -> None:
     assert np.ptp(drawn[:, 1]) == 0.0
     assert np.median(drawn[:, 0]) == pytest.approx(10.0 * 9 / stats.chi2.median(9) - 1.0, rel=0.15)  # 400 draws: 3 %
     assert (draw_components(np.array([9.0]), np.array([1.0]), 0.0, TRIALS, rng) == 9.0).all()
+    some = draw_components(np.array([9.0, 9.0]), np.array([1.0, 1.0]), np.array([9.0, 0.0]), TRIALS, rng)
+    assert np.ptp(some[:, 0]) > 1.0
+    assert np.ptp(some[:, 1]) == 0.0

@@ -250,3 +250,37 @@ def test_what_follows_from_a_solution_is_part_of_result_plan_and_trials() -> Non
     assert "largest" in method.plan(SETTINGS)
     redrawing = redrawing_of(method, raw, SETTINGS, errors)
     assert "largest" in trial(method, redrawing, np.random.SeedSequence(7))
+
+
+def test_an_error_along_one_direction_is_a_deviation() -> None:
+    class Along(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            along = np.tile([0.6, 0.0, 0.8, 0.0, 0.0, 0.0], (raw.sizes["time"], 1))
+            return replace(super().observe(raw, settings), sensitivity=along)
+
+        def results(self, observed: Observed, fit: Any, relative: Any) -> dict[str, xr.DataArray]:
+            return {"last": xr.DataArray(relative.errors.value[-1, 0], attrs={"units": "m"})}
+
+    method = Along()
+    raw, truth = method.simulate(SETTINGS, 1)
+    errors, of_freedom = method.identify(raw, SETTINGS), METHOD.identify(raw, SETTINGS)
+    np.testing.assert_array_equal(errors["deviation"], of_freedom["EZ"])
+    np.testing.assert_array_equal(errors["deviation_variance"], of_freedom["covariance"].values[:, 2, 2])
+    np.testing.assert_array_equal(errors["deviation_influence"], of_freedom["influence"].values[..., 2])
+    assert errors["sensitivity"].values[3].tolist() == [0.6, 0.0, 0.8, 0.0, 0.0, 0.0]
+    assert np.isnan(errors["EZ"]).all()
+    assert float(np.abs(truth["deviation_variance"]).max()) == 0.0
+    plan = method.plan(SETTINGS)
+    assert float(np.abs(plan["deviation"]).max()) == float(plan["last"]) == 0.0
+    assert float(errors["last"]) == float(errors["deviation"][-1])
+
+
+def test_one_dim_of_the_result_needs_no_coordinate() -> None:
+    class Twice(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            observed = super().observe(raw, settings)
+            side = {"side": ("side", ["a", "b"], {"long_name": "side of the table"})}
+            return replace(observed, dims=("side", "target"), coords=side, recorded=None)
+
+    errors = Twice().identify(METHOD.simulate(SETTINGS, 1)[0], SETTINGS)
+    assert dict(errors["EZ"].sizes) == {"side": 2, "target": SETTINGS.times // 2}

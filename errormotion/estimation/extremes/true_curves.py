@@ -99,7 +99,7 @@ def draw_variances(
 
 
 def draw_components(
-    estimate: Array, noise: Array, freedom: float, trials: int, generator: np.random.Generator
+    estimate: Array, noise: Array, freedom: float | Array, trials: int, generator: np.random.Generator
 ) -> Array:
     """Return draws of components of variance, (trial, k), of which noise has been subtracted.
 
@@ -107,19 +107,17 @@ def draw_components(
     ----------
     estimate, noise : ndarray, (k,)
         ``estimate + noise`` has been estimated with ``freedom`` degrees of freedom, ``noise`` is known.
-    freedom : float
+    freedom : float or ndarray, (k,)
         0 for components that are stated: they are not drawn. Neither is one that does not differ significantly from 0;
         its distribution would be that of the noise.
     """
-    variances = np.tile(estimate, (trials, 1))
-    if freedom > 0:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = (estimate + noise) / noise
-        significant = special.chdtrc(freedom, freedom * ratio) < SIGNIFICANT
-        scale = freedom / generator.chisquare(freedom, (trials, estimate.size))
-        with_noise = np.maximum(scale * (estimate + noise) - noise, 0.0)
-        variances = np.where(significant, with_noise, variances)
-    return np.asarray(variances)
+    known = np.broadcast_to(np.asarray(freedom, dtype=float), estimate.shape)
+    degrees = np.where(known > 0, known, 1.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = (estimate + noise) / noise
+    significant = (known > 0) & (special.chdtrc(degrees, degrees * ratio) < SIGNIFICANT)
+    scale = degrees / generator.chisquare(degrees, (trials, estimate.size))
+    return np.where(significant, np.maximum(scale * (estimate + noise) - noise, 0.0), estimate)
 
 
 def _true_share(observed: Array, noise: Array) -> Array:
