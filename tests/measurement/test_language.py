@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.estimation.checks.exclusions import Cleaned, Exclusion, notes
+from errormotion.estimation.checks.exclusions import Cleaned, Exclusion, doubts, notes
 from errormotion.estimation.variance import variance_factor
 from errormotion.report.page.language import Catalogue
 
@@ -38,7 +38,7 @@ def test_notes_on_exclusions_are_in_the_german_catalogue(count):
 
     found = Found(fit=None, made=(one,), undecided=(one, rival), unchecked=out)
     german = Catalogue("de", [{"touches": "Antastungen"}])
-    texts = notes(found, "touches")
+    texts = [*notes(found, "touches"), *doubts(found, "touches")]
     assert len(texts) == 3
     for text in texts:
         assert "Antastungen" in german(text)

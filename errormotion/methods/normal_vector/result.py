@@ -12,7 +12,6 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import provenance
 from errormotion.errors import MethodError
-from errormotion.estimation.checks import exclusions
 from errormotion.estimation.checks.exclusions import Exclusion
 from errormotion.estimation.sources import Errors, Source
 from errormotion.estimation.variance import expansion
@@ -52,14 +51,11 @@ class Excluded:
         Balls that moved: what was found, the ball, and the first cycle after the move.
     lost : ndarray of int
         Cycles that do not determine the motion.
-    undecided : sequence of Exclusion
-        Contradictions that remain.
     """
 
     wrong: NDArray[np.bool_]
     moves: list[tuple[Exclusion, int, int]]
     lost: NDArray[np.intp]
-    undecided: Sequence[Exclusion]
 
     @classmethod
     def of(cls, solved: Solved, probing: Probing) -> Excluded:
@@ -75,7 +71,7 @@ class Excluded:
             else:
                 wrong |= each.readings.any(axis=1).reshape(k, b, -1)
         lost = np.flatnonzero(~probing.usable(solved.fit.problem))
-        return cls(wrong, moves, lost, () if search is None else search.undecided)
+        return cls(wrong, moves, lost)
 
 
 def identified(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
@@ -92,9 +88,9 @@ def identified(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.D
         steps = ["normals of two planes through four balls, Cayley"]
     if solved.cleaned is not None:
         steps += [f"excluded: {each.words}" for each in solved.cleaned.made]
-    for note in solved.observed.notes:
-        log.warning(note)
     found = dataset(method, solved, raw, method.info, provenance.make(settings, raw, None, steps=steps))
+    for note in found.em.notes:
+        log.warning(note)
     return found.assign_attrs(tool_axes=str(raw.attrs.get("tool_axes", settings.tool_axes)))
 
 
@@ -125,12 +121,16 @@ def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequen
         raise MethodError("procedure = normals: " + why)
     chosen = best if other is None or settings.procedure == "rigid" else other
     time = _times(probing, seen, excluded)
-    axes = contradiction(solved, probing, settings.smallest_move)
-    texts = [*notes, axes, solved.scatter.note, *_exclusions(solved, excluded, data), why]
+    several = (
+        "More than one ball appears to have moved. Check their mounting and the axes that carry the tool (tool_axes). "
+        "A machine that does not move as one rigid frame has the same effect."
+    )
+    doubts = [contradiction(solved, probing, settings.smallest_move), several if len(excluded.moves) > 1 else ""]
     observed = replace(
         solved.observed,
         coords=dict(solved.observed.coords) | {"time": ("time", time, {"units": "s"})},
-        notes=[text for text in texts if text],
+        notes=[*notes, *_exclusions(excluded, data), why],
+        doubts=[*solved.observed.doubts, *doubts],
         extras=_extras(
             probing, solved, excluded, centres(_every(probing, seen, excluded), anchor, reach), noise, best, other
         ),
@@ -140,12 +140,7 @@ def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequen
             "reference_interval": (float(time[0]), float(time[0])),
         },
     )
-    return replace(
-        solved,
-        observed=observed,
-        scatter=replace(solved.scatter, note=""),
-        relative=replace(solved.relative, errors=chosen),
-    )
+    return replace(solved, observed=observed, relative=replace(solved.relative, errors=chosen))
 
 
 def _compressed(errors: Errors, lost: NDArray[np.intp]) -> Errors:
@@ -236,7 +231,7 @@ def _times(probing: Probing, seen: Observations, excluded: Excluded) -> Array:
     return time
 
 
-def _exclusions(solved: Solved, excluded: Excluded, data: Readings) -> list[str]:
+def _exclusions(excluded: Excluded, data: Readings) -> list[str]:
     """Return notes on outliers, balls that moved, and cycles without a result."""
     notes: list[str] = []
     wrong = excluded.wrong if data.seen.touched else excluded.wrong.any(axis=2)
@@ -255,13 +250,6 @@ def _exclusions(solved: Solved, excluded: Excluded, data: Readings) -> list[str]
             f"{move.words[:1].upper()}{move.words[1:]}, by about ({shift}) um as measured; excluded from this cycle "
             f"on.{also}"
         )
-    if len(excluded.moves) > 1:
-        notes.append(
-            "More than one ball appears to have moved. Check their mounting and the axes that carry the tool "
-            "(tool_axes). A machine that does not move as one rigid frame has the same effect."
-        )
-    if solved.cleaned is not None:
-        notes += exclusions.notes(replace(solved.cleaned, made=()), data.what.removeprefix("the "))
     lost = excluded.lost
     if lost.size:
         shown = ", ".join(map(str, lost[:SHOWN])) + (f" and {lost.size - SHOWN} more" if lost.size > SHOWN else "")
