@@ -239,7 +239,7 @@ class ThermalModel:
             which = ", ".join(self.features[k].name for k in np.flatnonzero(features_outside.any(axis=0)))
             notes.append(f"{int(outside.sum())} of {n} times are outside the training range: {which}")
         if notes:
-            result.attrs["notes"] = json.dumps(notes)
+            result.attrs["notes"] = notes
         return result
 
     def _identities(self, names: list[str], kinds: list[str], own_hash: str) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +70,7 @@ def predict(model: Path, data: Path, out: Path, as_json: bool) -> None:
     with reading(f"{data} with {model}"), explained(data, inputs):
         predicted = used.predict(inputs)
     datasets.save(predicted, out)
-    notes = json.loads(predicted.attrs.get("notes", "[]"))
+    notes = predicted.em.notes
     if as_json:
         outside = float(predicted["outside"].mean())
         show_json(
