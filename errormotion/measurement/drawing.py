@@ -7,6 +7,7 @@ part of simulated data.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -89,7 +90,8 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     for key in ("covariance", "influence", "deviation_variance", "deviation_influence"):
         if key in zero:
             zero[key] = zero[key].copy(data=np.where(np.isfinite(zero[key].values), 0.0, np.nan))
-    return measured.assign_attrs(machine="simulated"), zero.assign_attrs(machine="simulated")
+    made = json.dumps([{"id": f"model of {info.id}", "simulated": True}])
+    return measured.assign_attrs(machine="simulated", instruments=made), zero.assign_attrs(machine="simulated")
 
 
 def _drawn(problem: Problem) -> dict[str, int]:

@@ -13,6 +13,8 @@ from errormotion.report import settings
 from errormotion.report.document import Block, Cell, Source, Table, Text
 from errormotion.report.text import DASH
 
+SIMULATED = "simulated"
+"""Machine of data that a method simulates from its own model."""
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
 _RUN = ("campaign", "bench", "inputs", "samples")
 _ROOT = r"(?:~[\\/]|/|[A-Za-z]:[\\/]|\\\\)"

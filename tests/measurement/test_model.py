@@ -12,6 +12,7 @@ from pydantic import Field
 
 from errormotion import datasets
 from errormotion.arrays import Array
+from errormotion.datasets.provenance import of
 from errormotion.datasets.schemas import NO_LIMIT, NOISE, READING, RawSchema, Row
 from errormotion.errors import MethodError
 from errormotion.estimation.blocks import Block, Constant, Noise
@@ -23,6 +24,7 @@ from errormotion.measurement.drawing import READINGS
 from errormotion.measurement.identification import Solved
 from errormotion.montecarlo.trials import redrawing_of, trial, values_of
 from errormotion.plugins import MethodInfo, Needs, PluginSettings
+from errormotion.report.provenance import simulated
 
 T = TypeVar("T")
 SCHEMA = "errormotion.raw.drift_of_scale/1"
@@ -284,3 +286,9 @@ def test_one_dim_of_the_result_needs_no_coordinate() -> None:
 
     errors = Twice().identify(METHOD.simulate(SETTINGS, 1)[0], SETTINGS)
     assert dict(errors["EZ"].sizes) == {"side": 2, "target": SETTINGS.times // 2}
+
+
+def test_simulated_data_state_that_no_instrument_measured() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = METHOD.identify(raw, SETTINGS)
+    assert simulated(of(errors)) == "the provenance marks them as simulated"

@@ -70,7 +70,7 @@ def page(
         "facts": [(name, t(name), t.word(fact) if name in _COMPOSED else fact) for name, fact in found],
         "calibrations": calibrated,
         "decision": decision,
-        "simulated": provenance.simulated(everything) or _truth(sources),
+        "simulated": provenance.simulated(everything) or _without_machine(sources),
         "replayed": provenance.replayed(everything),
         "parts": body,
         "annex": appended,
@@ -143,7 +143,11 @@ def _identity(source: Source) -> str:
     return f"{source.run.get('id')} {attributes.get('start')} {dict(source.errors.sizes)}"
 
 
-def _truth(sources: Sequence[Source]) -> str:
+def _without_machine(sources: Sequence[Source]) -> str:
+    """Return why data are no measurement of a machine: the truth of a virtual one, or simulated by a model."""
     if any(source.errors.attrs.get("method") == "twin" for source in sources):
         return "the values are the truth of a virtual machine"
-    return ""
+    stated = [
+        each.attrs.get("machine") for source in sources for each in (source.errors, source.raw) if each is not None
+    ]
+    return "the data state the machine as 'simulated'" if provenance.SIMULATED in stated else ""
