@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.results.places import in_field_units
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.report.exports.tables import plain_text
@@ -164,7 +165,8 @@ def _abscissa(ds: xr.Dataset, dim: str) -> tuple[str, Array, tuple[str, ...]]:
     size = ds.sizes[dim]
     if dim in ds.coords and ds[dim].dtype.kind in "iuf":
         if dim not in ("target", "beam"):
-            return f"{dim} / {ds[dim].attrs.get('units', '1')}", np.asarray(ds[dim].values, dtype=float), ()
+            places, unit = in_field_units(ds[dim])
+            return (dim if unit == "1" else f"{dim} / {unit}"), places, ()
         return f"number of the {dim}", np.arange(size, dtype=float), tuple(f"{each:g}" for each in ds[dim].values)
     texts = ds[dim].values if dim in ds.coords else np.arange(size)
     return dim, np.arange(size, dtype=float), tuple(str(each) for each in texts)

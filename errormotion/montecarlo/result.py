@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets import hash_dataset
-from errormotion.datasets.schemas import DOF, ERROR_ROWS
+from errormotion.datasets.results.places import place_of
+from errormotion.datasets.schemas import DOF
 from errormotion.datasets.storage.compression import as_stored
 from errormotion.errors import DatasetError
 from errormotion.montecarlo.adaptive import Summary
@@ -39,8 +40,6 @@ TABLE: dict[str, tuple[tuple[str, ...], str]] = {
 LABELS = {"dof": (*DOF, "deviation"), "limit": ("low", "high")}
 ATTRIBUTES = ("method", "method_version", "machine", "component", "frame", "functional_point", "reference", "sign")
 NUMBERS = ("trials", "probability", "digits", "seed")
-
-UNITS = {row.name: row.unit for row in ERROR_ROWS}
 
 
 def build(
@@ -224,22 +223,10 @@ def lines(ds: xr.Dataset) -> list[Line]:
         candidates = np.where(moving & (verdict == value), ratio, -1.0)
         at = int(np.argmax(candidates))
         low, high = one["symmetric"].transpose(*own, "limit").values.reshape(-1, 2)[at]
+        place = place_of(one, own, np.unravel_index(at, [one.sizes[dim] for dim in own]) if own else ())
         found.append(
             Line(name, value, float(u[at]), float(one["uncertainty"].values.ravel()[at]), float(tolerance[at]),
                  float(distance[at]), (float(y[at] - factor * u[at]), float(y[at] + factor * u[at])),
-                 (float(low), float(high)), _place(one, own, at), int((worst != VALIDATED).sum()), int(moving.sum()))
+                 (float(low), float(high)), place, int((worst != VALIDATED).sum()), int(moving.sum()))
         )  # fmt: skip
     return found
-
-
-def _place(ds: xr.Dataset, dims: list[str], number: int) -> str:
-    """Return a place as text."""
-    index = np.unravel_index(number, [ds.sizes[dim] for dim in dims]) if dims else ()
-    parts = []
-    for dim, i in zip(dims, index, strict=True):
-        if ds.sizes[dim] == 1:
-            continue
-        label = ds[dim].values[i] if dim in ds.coords else i + 1
-        unit = str(ds[dim].attrs.get("units", UNITS.get(dim, ""))) if dim in ds.coords else ""
-        parts.append(f"{dim} {label:g} {unit}".strip() if isinstance(label, float) else f"{dim} {label}")
-    return ", ".join(parts)

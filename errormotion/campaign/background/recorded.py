@@ -15,6 +15,7 @@ from errormotion.campaign.compensation.following import STATUS, read_status
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.runner import stored_plan
 from errormotion.campaign.storage.store import committed_length
+from errormotion.datasets.results.places import in_field_units
 
 MAX_VALUES = 200
 """Number of values of one sample that are returned."""
@@ -105,5 +106,10 @@ def _last(raw: xr.Dataset, dim: str, count: int) -> Iterator[Value]:
 def _label(raw: xr.Dataset, dim: str, index: int) -> str:
     if dim in raw.coords and raw[dim].ndim == 1:
         found = raw[dim].values[index]
-        return str(found) if isinstance(found, str) else f"{dim} {found:g}" if np.isreal(found) else str(found)
+        if isinstance(found, str):
+            return str(found)
+        if np.isreal(found):
+            values, unit = in_field_units(raw[dim])
+            return f"{dim} {values[index]:g} {unit}".removesuffix(" 1")
+        return str(found)
     return f"{dim} {index + 1}"

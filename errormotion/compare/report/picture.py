@@ -9,6 +9,8 @@ from matplotlib.figure import Figure
 
 from errormotion.arrays import Array
 from errormotion.compare.pairs import COVERAGE_FACTOR
+from errormotion.datasets.results.places import in_field_units
+from errormotion.datasets.schemas import ERROR_DIMS
 from errormotion.kinematics.iso import DOF
 from errormotion.report.canvas import COLOURS, GREEN, curve, style
 
@@ -143,6 +145,9 @@ def abscissa(ds: xr.Dataset) -> tuple[Array, str, bool]:
     for name in ("x", "y", "z"):
         if dim == "position" and name in ds.coords and ds[name].dims == (dim,):
             return np.asarray(ds[name].values) * 1e3, f"{name.upper()} / mm", True
+    if dim not in ERROR_DIMS and dim in ds.coords and ds[dim].dtype.kind == "f":
+        places, unit = in_field_units(ds[dim])
+        return places, dim if unit == "1" else f"{dim} / {unit}", True
     return np.arange(ds.sizes[dim], dtype=float), f"{dim} number", False
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-from errormotion.datasets.results.plotting.scales import UNITS, scale_of, short
+from errormotion.datasets.results.places import scale_of, short
+from errormotion.datasets.results.plotting.scales import UNITS
 from errormotion.datasets.units import convert, format_quantity
 
 TRIPLES = (("EX", "EY", "EZ"), ("EA", "EB", "EC"))

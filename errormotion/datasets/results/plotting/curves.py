@@ -7,7 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.plotting.scales import COLOURS, MARKERS, UNITS, Scale, legend, mark, over, scale_of
+from errormotion.datasets.results.places import Scale, scale_of
+from errormotion.datasets.results.plotting.scales import COLOURS, MARKERS, UNITS, legend, mark, over
 from errormotion.datasets.units import convert
 
 _SPREAD = 0.5

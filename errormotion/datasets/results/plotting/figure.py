@@ -13,8 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from errormotion.datasets.results.places import scale_of
 from errormotion.datasets.results.plotting import arrows, curves, maps
-from errormotion.datasets.results.plotting.scales import MAX_LINES, UNITS, over, scale_of
+from errormotion.datasets.results.plotting.scales import MAX_LINES, UNITS, over
 from errormotion.datasets.results.tables import chosen
 from errormotion.errors import DatasetError
 

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import CenteredNorm, LinearSegmentedColormap
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.plotting.scales import UNITS, Scale, mark, scale_of
+from errormotion.datasets.results.places import Scale, scale_of
+from errormotion.datasets.results.plotting.scales import UNITS, mark
 from errormotion.datasets.units import convert, format_quantity
 
 DIVERGING = LinearSegmentedColormap.from_list(
