@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from errormotion.datasets.results.effects import change_of, influence_of
 from errormotion.errors import DatasetError, ErrormotionError, RunError
 from errormotion.plugins import FigureOfMerit
 from errormotion.record.runs.entry import Entry
@@ -164,7 +165,7 @@ def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
         given = _influence(errors, stated.name)
         for row, identity in _identified(errors):
             source = str(errors["source"].values[row])
-            effect = _change(errors, row, stated.name) if given is None else float(given.get(source, 0.0))
+            effect = change_of(errors, row, stated.name) if given is None else float(given.get(source, 0.0))
             if np.isfinite(effect):
                 effects[identity] = effects.get(identity, 0.0) + effect
     return Reading(entry.folder, stated.name, _time(entry), stated.value, u, stated.unit, effects, origin, version)
@@ -177,33 +178,9 @@ def _influence(errors: xr.Dataset, name: str) -> Mapping[str, float] | None:
     return next((each.influence for each in figures_of(errors) if each.name == name), None)
 
 
-def _change(errors: xr.Dataset, row: int, name: str) -> float:
-    """Return the change of a figure for one standard uncertainty of a source in the errors."""
-    high, low = (_figure(_moved(errors, row, sign), name) for sign in (1.0, -1.0))
-    return 0.5 * (high - low)
-
-
-def _figure(errors: xr.Dataset, name: str) -> float:
-    from errormotion.datasets.results.merit import figures_of
-
-    return next((each.value for each in figures_of(errors) if each.name == name), np.nan)
-
-
-def _moved(errors: xr.Dataset, row: int, sign: float) -> xr.Dataset:
-    """Return errors changed by one standard uncertainty of a source."""
-    names = errors.em.names
-    influence = "influence" if len(names) > 1 else "deviation_influence"
-    changed = {}
-    for k, name in enumerate(names):
-        F = errors[influence].isel(source=row)
-        F = F.isel(dof=k, drop=True) if "dof" in F.dims else F
-        changed[name] = errors[name].copy(data=errors[name].values + sign * F.transpose(*errors[name].dims).values)
-    return errors.assign(changed)
-
-
 def _identified(errors: xr.Dataset) -> list[tuple[int, str]]:
     """Return row and identity of the sources that have an identity."""
-    influence = "influence" if len(errors.em.names) > 1 else "deviation_influence"
+    influence = influence_of(errors)
     if "source_id" not in errors.variables or influence not in errors.variables:
         return []
     return [(row, str(each)) for row, each in enumerate(errors["source_id"].values) if str(each)]
@@ -237,7 +214,7 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
         place = int(known[-1])
     u = errors.em.expanded(1.0).values.reshape(-1, len(errors.em.names))[place, k]
     effects = dict[str, float]()
-    influence = "influence" if len(errors.em.names) > 1 else "deviation_influence"
+    influence = influence_of(errors)
     for row, identity in _identified(errors):
         F = errors[influence].transpose("source", ..., *(["dof"] if influence == "influence" else [])).values[row]
         effect = F.reshape(-1, len(errors.em.names))[place, k]

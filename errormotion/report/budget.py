@@ -12,7 +12,7 @@ from errormotion.report.document import Cell, Table, estimate, or_dash
 from errormotion.report.text import SECOND_OF_ARC, UM, decimals_of, fixed
 
 FREEDOMS = ("EX", "EY", "EZ", "EA", "EB", "EC")
-_INDEPENDENT = "sensor noise, independent from instant to instant"
+_INDEPENDENT = "independent noise"
 
 
 def groups_at(errors: xr.Dataset) -> dict[str, np.ndarray]:
@@ -33,8 +33,11 @@ def sigma(errors: xr.Dataset) -> np.ndarray:
     return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
-def table(errors: xr.Dataset, when: str) -> Table:
-    """Return the budget table at one position or time; ``errors`` has no such dims."""
+def table(errors: xr.Dataset, when: str, along: str = "") -> Table:
+    """Return the budget table at one position or time; ``errors`` has no such dims.
+
+    ``along`` is the name of a place, such as ``instant``, from one to another of which the noise is independent.
+    """
     groups = groups_at(errors)
     names = errors.em.names
     units = [UM if i < 3 else SECOND_OF_ARC for i in range(len(names))]
@@ -54,16 +57,18 @@ def table(errors: xr.Dataset, when: str) -> Table:
         f"{'six error motions at the functional point' if len(names) > 1 else names[0]}, by group of sources.",
         ["source", *(f"{name} / {unit}" for name, (unit, _) in zip(names, units, strict=True))],
         [
-            *(row(readable(name), values) for name, values in groups.items()),
+            *(row(readable(name, along), values) for name, values in groups.items()),
             row("combined, k = 1", combined),
             row("expanded, k = 2", 2 * combined),
         ],
     )
 
 
-def readable(group: str) -> str:
-    """Return the readable name of a group of sources."""
-    return _INDEPENDENT if group == "independent" else group.replace("_", " ")
+def readable(group: str, along: str = "") -> str:
+    """Return the readable name of a group of sources; ``along`` as in `table`."""
+    if group != "independent":
+        return group.replace("_", " ")
+    return f"noise, independent from {along} to {along}" if along else _INDEPENDENT
 
 
 def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:

@@ -5,13 +5,17 @@ Chapters build them from datasets; templates render them. Text is plain text, wh
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import xarray as xr
 from markupsafe import Markup
 
+from errormotion.datasets.results.merit import figures_of
+from errormotion.plugins import ERRORS_SCHEMA, FigureOfMerit
 from errormotion.report.text import DASH, rounded
 
 
@@ -85,15 +89,21 @@ class Figure:
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """One of the most important numbers, for the head of the report."""
+    """One of the most important numbers, for the head of the report.
+
+    ``named``: the label is a name of the data, which the page translates only if a catalogue contains it.
+    """
 
     label: str
     value: Cell
     unit: str
     note: str = ""
+    named: bool = False
 
 
 Block = Text | Table | Figure
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -139,7 +149,8 @@ class Source:
     key : str
         Prefix that makes the identifiers of figures unique in the page.
     limits : mapping of str to (lower, upper)
-        Limits of freedoms by name, SI; infinite where there is none. Drawn as lines.
+        Limits of freedoms and figures of merit by name, SI; infinite where there is none. Those of freedoms are lines
+        in the drawings.
     """
 
     errors: xr.Dataset
@@ -148,6 +159,17 @@ class Source:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     key: str = "p1"
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @cached_property
+    def merit(self) -> tuple[Sequence[FigureOfMerit], str]:
+        """The figures of merit; and if the plugin could not compute them, what failed."""
+        if str(self.errors.attrs.get("schema")) != ERRORS_SCHEMA:
+            return (), ""
+        try:
+            return figures_of(self.errors), ""
+        except Exception as error:  # of a plugin
+            log.exception("the figures of merit failed")
+            return (), f"{type(error).__name__}: {error}"
 
     @property
     def settings(self) -> Mapping[str, Any]:

@@ -99,7 +99,8 @@ def sentences(errors: xr.Dataset, raw: xr.Dataset | None) -> list[Block]:
     for share, names in shares.items():
         if share < 1:
             kind = "plain" if share > 0.999 else "warning"
-            blocks.append(Text(f"{listed(names)}: determined at {percent(share)} of the instants.", kind))
+            places = "instants" if errors["EX"].dims == ("time",) else "places"
+            blocks.append(Text(f"{listed(names)}: determined at {percent(share)} of the {places}.", kind))
     counted = counts(errors, raw)
     if counted:
         words = ", ".join(f"{name} {number}" for name, number in counted.items())

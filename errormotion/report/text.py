@@ -22,6 +22,7 @@ MINUTE = ("min", 60.0)
 
 _MICRO = re.compile(r"(?<!\w)u(?=(?:m|rad)(?!\w))")
 _CELSIUS = re.compile(r"\bdegC\b")
+_DEGREE = re.compile(r"(?:(?<=\d) |(?<= / ))deg\b")
 _MINUS = re.compile(r"(?<![\w)\]-])-(?=\d)")
 _AND = {"en": "and", "de": "und"}
 _LANGUAGE: ContextVar[str] = ContextVar("language", default="en")
@@ -49,8 +50,8 @@ def laid_out(text: str) -> str:
 
 
 def signs(text: str) -> str:
-    """Return a text of the terminal with the signs of a page: those of micro, minus and degrees Celsius."""
-    return _CELSIUS.sub("°C", _MINUS.sub("−", _MICRO.sub("µ", text)))
+    """Return a text of the terminal with the signs of a page: those of micro, minus, degrees and degrees Celsius."""
+    return _DEGREE.sub("°", _CELSIUS.sub("°C", _MINUS.sub("−", _MICRO.sub("µ", text))))
 
 
 def typographic(text: str) -> str:

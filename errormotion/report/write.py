@@ -162,7 +162,8 @@ def catalogue_of(source: Source, language: str) -> Mapping[str, str]:
 
 
 def _limits(tolerances: Tolerances | None) -> dict[str, tuple[float, float]]:
-    return {name: limit.interval for name, limit in tolerances.freedoms.items()} if tolerances is not None else {}
+    stated = {} if tolerances is None else {**tolerances.figures, **tolerances.freedoms}
+    return {name: limit.interval for name, limit in stated.items()}
 
 
 def _judged(sources: Sequence[Source], tolerances: Tolerances) -> list[Conformity]:

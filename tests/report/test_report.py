@@ -179,7 +179,7 @@ def test_a_missing_iso_value_has_a_reason(read, make_drift):
 
 
 def test_the_budget_names_its_groups_and_adds_up(page, drift):
-    for name in ("beams", "reference", "expansion", "sensor noise", "combined, k = 1", "expanded, k = 2"):
+    for name in ("beams", "reference", "expansion", "independent noise", "combined, k = 1", "expanded, k = 2"):
         assert name in page.text
 
 

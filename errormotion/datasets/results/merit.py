@@ -30,6 +30,11 @@ def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
     return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
 
 
+def states_figures(errors: xr.Dataset) -> bool:
+    """Return whether the plugin that made a dataset states its figures of merit."""
+    return hasattr(plugins.owner_of_method(str(errors.attrs.get("method"))), "figures")
+
+
 def stored(figure: FigureOfMerit) -> dict[str, Any]:
     """Return a figure for a JSON file, SI; unknown numbers are None."""
     numbers = {"value": figure.value, "expanded_uncertainty": figure.expanded_uncertainty, "limit": figure.limit}

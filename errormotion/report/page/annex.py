@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from errormotion import plugins
-from errormotion.datasets.results.merit import figures_of
 from errormotion.report.document import Block, Cell, Part, Section, Source, Table, Text, or_dash
 from errormotion.report.text import DASH, typographic
 
 SECTION = "provenance"
 """Name of the sections of chapters that belong to the annex."""
-
-log = logging.getLogger(__name__)
 
 
 def divided(parts: Sequence[Part]) -> tuple[list[Part], list[Section]]:
@@ -36,14 +31,9 @@ def values(sources: Sequence[Source]) -> list[Section]:
     """Return the section of the figures of merit in SI units, unrounded; empty without figures of merit."""
     blocks: list[Block] = []
     for source in sources:
-        if str(source.errors.attrs.get("schema")) != plugins.ERRORS_SCHEMA:
-            continue
-        try:
-            figures = figures_of(source.errors)
-        except Exception as error:  # of a plugin
-            log.exception("the figures of merit failed")
-            blocks.append(Text(f"The figures of merit could not be computed: {type(error).__name__}: {error}.", "note"))
-            continue
+        figures, failure = source.merit
+        if failure:
+            blocks.append(Text(f"The figures of merit could not be computed: {failure}.", "note"))
         rows: list[list[Cell | str]] = [
             [each.name, _number(each.value), _number(each.expanded_uncertainty), each.unit or "1"] for each in figures
         ]

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from markupsafe import Markup
 
-from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Table, Text
+from errormotion.report.document import Block, Cell, Figure, Part, Section, Table, Text
 from errormotion.report.text import signs
 
 LANGUAGES = ("en", "de")
@@ -37,7 +37,7 @@ _SENTENCES = re.compile(r"(?<=[.!?]) (?=[A-ZÄÖÜ(|±])")
 _DECIMAL = re.compile(r"[+−-]?\d+\.\d+")
 _WORD = re.compile(r"[a-z]{3}")
 _LETTERS = re.compile(r"[a-z]{2}")
-_BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w))")
+_BEFORE_UNIT = re.compile(r"(?<![\w.])\d+\.\d+(?= (?:[uµ]?m|mm|[uµm]?rad|arcsec|%|K|min|s|±)(?!\w)|°)")
 _NUMBER = re.compile(r"(?<![\w.])\d+\.\d+(?!\w|\.\d)")
 _RANGE = re.compile(r"(?<=[\d%∞]) to (?=[+−]?[\d∞])")
 _LIST = re.compile(r"(, | und )")
@@ -193,7 +193,13 @@ class Catalogue:
             title=self(part.title),
             kind=self(part.kind),
             key_figures=[
-                KeyFigure(self(each.label), Cell(**vars(self.cell(each.value))), self.word(each.unit), self(each.note))
+                replace(
+                    each,
+                    label=self.word(each.label) if each.named else self(each.label),
+                    value=Cell(**vars(self.cell(each.value))),
+                    unit=self.word(each.unit),
+                    note=self(each.note),
+                )
                 for each in part.key_figures
             ],
             summary=[self(sentence) for sentence in part.summary],

@@ -1,0 +1,46 @@
+"""Chapters as data: a method states which quantities a chapter shows, and the parts read the dataset.
+
+Field units, intervals, reasons of missing values, translation, and the tables as CSV and XLSX come with the parts. A
+method draws by hand only what is its own, and adds it by `Own`.
+"""
+
+from errormotion.report.elements.chapter import Chapter, Element, Own, Section, Sentence
+from errormotion.report.elements.drawings import Curves, Map, PolarPlot
+from errormotion.report.elements.figures import FigureBudget, FigureTable, KeyFigures
+from errormotion.report.elements.quantities import Of
+from errormotion.report.elements.standard import (
+    PROVENANCE,
+    UNCERTAINTY,
+    Budget,
+    Further,
+    Notes,
+    Provenance,
+    Reliability,
+    Spans,
+)
+from errormotion.report.elements.tables import Column, Table
+
+__all__ = [
+    "PROVENANCE",
+    "UNCERTAINTY",
+    "Budget",
+    "Chapter",
+    "Column",
+    "Curves",
+    "Element",
+    "FigureBudget",
+    "FigureTable",
+    "Further",
+    "KeyFigures",
+    "Map",
+    "Notes",
+    "Of",
+    "Own",
+    "PolarPlot",
+    "Provenance",
+    "Reliability",
+    "Section",
+    "Sentence",
+    "Spans",
+    "Table",
+]

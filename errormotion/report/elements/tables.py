@@ -1,0 +1,201 @@
+"""Tables of a chapter as data: variables over the dims of a dataset, one row for each place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+
+from errormotion.arrays import Array
+from errormotion.datasets.results.places import place_of
+from errormotion.report import document
+from errormotion.report.document import Block, Cell, Source, Text, estimate
+from errormotion.report.elements.quantities import Of, Quantity
+from errormotion.report.text import DASH, fixed, integer, percent, significant
+
+MISSING = "not part of this result"
+"""Reason of a dash where the dataset lacks a variable."""
+_MOST = 240
+"""Rows of a table; more are in the dataset."""
+
+REDUCTIONS: dict[str, Callable[[Array], float]] = {
+    "rms": lambda values: float(np.sqrt(np.mean(np.square(values)))),
+    "largest": lambda values: float(np.abs(values).max()),
+    "lowest": lambda values: float(values.min()),
+    "highest": lambda values: float(values.max()),
+    "mean": lambda values: float(values.mean()),
+    "median": lambda values: float(np.median(values)),
+    "sum": lambda values: float(values.sum()),
+    "first": lambda values: float(values[0]),
+    "last": lambda values: float(values[-1]),
+}
+"""Reductions of the known values of one row over all dims that are not those of the rows."""
+
+FORMATS: dict[str, Callable[[float], str]] = {"integer": integer, "percent": percent}
+"""Formats of a number by name."""
+
+
+@dataclass(frozen=True)
+class Column(Of):
+    """One column of a table.
+
+    Attributes
+    ----------
+    head : str
+        Its name; by default that of the variable. The unit is added.
+    format : str or callable
+        ``.2``: two decimals, ``3``: three significant digits, ``integer``, ``percent``, or a function of the value in
+        the unit of the column. By default a value follows its uncertainty, else it has four significant digits.
+    signed : bool
+        Whether a positive value has a plus sign.
+    reason : str
+        Why a value is unknown: the footnote of its dash, or the name of a variable of texts over the rows.
+    reduce : str
+        How the values at one row become one number: a key of `REDUCTIONS`. The uncertainty is left out.
+    """
+
+    head: str = ""
+    format: str | Callable[[float], str] = ""
+    signed: bool = True
+    reason: str = "not determined"
+    reduce: str = ""
+
+    def title(self, quantity: Quantity | None) -> str:
+        """Return the head of the column."""
+        name = self.head or (quantity.name if quantity is not None else str(self.variable))
+        unit = quantity.unit if quantity is not None else ""
+        if unit and self.format != "percent" and " / " not in name:
+            return f"{name} / {unit}"
+        return name
+
+    def cell(self, value: float, u: float, reason: str) -> Cell:
+        """Return a cell; value and standard uncertainty in the unit of the column."""
+        if not np.isfinite(value):
+            return Cell(DASH, reason=reason)
+        if np.isfinite(u) and not self.format:
+            return estimate(value, 2 * u, signed=self.signed)
+        if callable(self.format):
+            return Cell(self.format(value))
+        if self.format.startswith("."):
+            return Cell(fixed(value, int(self.format[1:]), signed=self.signed))
+        if self.format in FORMATS:
+            return Cell(FORMATS[self.format](value))
+        digits = int(self.format or 4)
+        text = significant(value, digits)
+        return Cell(f"+{text}" if self.signed and value > 0 and not text.startswith("+") else text)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with one row for each place along dims of the dataset.
+
+    A variable that the dataset lacks is a column of dashes; without any of its variables, the table is left out.
+
+    Attributes
+    ----------
+    caption : str
+        `{name}` is replaced by an attribute of the dataset.
+    columns : sequence of Column
+    over : str or sequence of str
+        Dims of the rows; the first of several dims groups the rows.
+    head : str
+        Name of the first column; by default that of the last dim.
+    place : callable
+        ``place(dataset, dims, index)``: a row's name; by default the places along the dims in field units.
+    where : callable
+        Returns which rows are shown, a `DataArray` of bool over the dims of the rows.
+    groups : sequence of (str, int)
+        Second head: names over several columns, from the first column.
+    notes : sequence of str
+        Below the table.
+    absent : str
+        A note in place of the table if there is nothing to show.
+    """
+
+    caption: str
+    columns: Sequence[Column]
+    over: str | Sequence[str]
+    head: str = ""
+    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = place_of
+    where: Callable[[xr.Dataset], xr.DataArray] | None = None
+    groups: Sequence[tuple[str, int]] = ()
+    notes: Sequence[str] = field(default=())
+    absent: str = ""
+
+    def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
+        """Return the table; a note or nothing without its variables."""
+        ds = source.errors
+        over = [self.over] if isinstance(self.over, str) else list(self.over)
+        found = [column.read(ds) for column in self.columns]
+        if not any(found) or not set(over) <= set(map(str, ds.sizes)):
+            return [Text(self.absent, "note")] if self.absent else []
+        shape = [ds.sizes[dim] for dim in over]
+        shown = np.ones(shape, bool)
+        if self.where is not None:
+            shown = np.asarray(self.where(ds).transpose(*over).values, dtype=bool)
+        made = [_column(ds, column, each, over, shape) for column, each in zip(self.columns, found, strict=True)]
+        rows: list[list[Cell | str]] = []
+        indices = np.argwhere(shown)
+        if not len(indices):
+            return [Text(self.absent, "note")] if self.absent else []
+        last = None
+        for index in indices[:_MOST]:
+            if len(over) > 1 and index[0] != last:
+                last = index[0]
+                rows.append([self.place(ds, over[:1], index[:1])])
+            own = slice(1, None) if len(over) > 1 else slice(None)
+            name = self.place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
+            rows.append([name, *(column[tuple(index)] for column in made)])
+        heads = [column.title(each) for column, each in zip(self.columns, found, strict=True)]
+        more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
+        caption = filled(self.caption, ds)
+        return [document.Table(caption, [self.head or over[-1], *heads], rows, self.groups, notes=[*self.notes, *more])]
+
+
+def filled(template: str, ds: xr.Dataset) -> str:
+    """Return a text with attributes of a dataset in the place of their names in braces."""
+    for name, value in ds.attrs.items():
+        if isinstance(value, str):
+            template = template.replace(f"{{{name}}}", value)
+    return template
+
+
+def _column(
+    ds: xr.Dataset, column: Column, quantity: Quantity | None, over: Sequence[str], shape: Sequence[int]
+) -> np.ndarray:
+    """Return the cells of a column over the dims of the rows."""
+    cells = np.empty(shape, dtype=object)
+    if quantity is None:
+        for index in np.ndindex(*shape):
+            cells[index] = Cell(DASH, reason=MISSING)
+        return cells
+    values, u = (_over(each, ds, over) for each in (quantity.values, quantity.u))
+    reasons = _over(ds[column.reason], ds, over) if column.reason in ds.variables else None
+    assert values is not None
+    for index in np.ndindex(*shape):
+        each = values[index]
+        if each.dtype.kind in "UO":
+            cells[index] = Cell(str(each.ravel()[0]))
+            continue
+        why = column.reason if reasons is None else str(reasons[index].ravel()[0]) or "not determined"
+        numbers = np.asarray(each, dtype=float).ravel() / quantity.size
+        if column.reduce:
+            known = numbers[np.isfinite(numbers)]
+            number = REDUCTIONS[column.reduce](known) if known.size else np.nan
+            cells[index] = column.cell(number, np.nan, why)
+        else:
+            spread = np.nan if u is None else float(u[index].ravel()[0]) / quantity.size
+            cells[index] = column.cell(float(numbers[0]), spread, why)
+    return cells
+
+
+def _over(values: xr.DataArray | None, ds: xr.Dataset, over: Sequence[str]) -> np.ndarray | None:
+    """Return values with the dims of the rows first, repeated along those that they lack."""
+    if values is None:
+        return None
+    spread = values.variable.set_dims(
+        {**{dim: ds.sizes[dim] for dim in over if dim not in values.dims}, **values.sizes}
+    )  # type: ignore[no-untyped-call]
+    return np.asarray(spread.transpose(*over, ...).values)

@@ -1,0 +1,313 @@
+"""Chapters as data: parts read a dataset, in field units, with uncertainty, reasons of missing values, and limits."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion import plugins
+from errormotion.datasets import build_errors
+from errormotion.plugins import FigureOfMerit
+from errormotion.report import write_report
+from errormotion.report.document import Cell, Figure, Source
+from errormotion.report.elements import (
+    Chapter,
+    Column,
+    Curves,
+    FigureBudget,
+    KeyFigures,
+    Map,
+    Of,
+    Own,
+    PolarPlot,
+    Section,
+    Sentence,
+    Table,
+)
+from errormotion.report.exports.tables import sheet
+from errormotion.report.parts import generic
+from errormotion.report.text import signs
+
+pytestmark = pytest.mark.usefixtures("translated")
+
+ANGLES = np.radians(15.0 * np.arange(24))
+GAIN, NOISE = 0.3e-6, 0.05e-6
+"""Standard uncertainties of EX by a source that all angles share, and by noise, m."""
+
+
+class Turning:
+    """A method outside of this repository, without chapters: it only states its figures."""
+
+    limit: float | None = None
+
+    def figures(self, errors):
+        u = float(np.hypot(GAIN, NOISE))
+        value = float(errors["EX"][0])
+        return [
+            FigureOfMerit("EX0C", value, 2 * u, "m", self.limit, {"gain": GAIN}),
+            FigureOfMerit("EA0C", 4e-6, 1e-6, "rad"),
+        ]
+
+
+def over_angles(value=20e-6, **more):
+    """Return errors over an angle with one source; EB is unknown at the second angle, EC everywhere."""
+    values = np.zeros((24, 6))
+    values[:, 0] = value * np.cos(2 * ANGLES)
+    values[:, 3] = 10e-6 * np.sin(ANGLES)
+    values[1, 4] = np.nan
+    values[:, 5] = np.nan
+    influence = np.zeros((1, 24, 6))
+    influence[0, :, 0] = GAIN
+    covariance = np.einsum("sni,snj->nij", influence, influence) + NOISE**2 * np.eye(6)
+    return build_errors(
+        values,
+        covariance,
+        dims=("angle",),
+        coords={"angle": ("angle", ANGLES, {"units": "rad", "long_name": "angle of C"})},
+        component="C",
+        machine="Five-axis machine",
+        frame="machine",
+        functional_point=[0, 0, 0],
+        reference="axis average line",
+        method="turning",
+        method_version="1",
+        provenance={"settings": {}},
+        influence=influence,
+        sources=["gain"],
+        source_groups=["gain of the sensors"],
+        extras={
+            "location": xr.DataArray([12e-6, np.nan], dims="line", attrs={"units": "m"}),
+            "location_u": xr.DataArray([1e-6, np.nan], dims="line", attrs={"units": "m"}),
+            "why": xr.DataArray(["", "the sphere has moved"], dims="line"),
+            "residual": xr.DataArray(np.full((24, 2), 3e-7), dims=("angle", "sensor"), attrs={"units": "m"}),
+        },
+        **more,
+    )
+
+
+@pytest.fixture
+def foreign(monkeypatch):
+    """Make `Turning` the owner of its datasets."""
+    method = Turning()
+    known = plugins.owner_of_method
+    monkeypatch.setattr(plugins, "owner_of_method", lambda name: method if name == "turning" else known(name))
+    return method
+
+
+def text_of(path):
+    return " ".join(re.sub(r"<[^>]+>", " ", path.read_text(encoding="utf-8")).split())
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_foreign_method_has_its_figures_at_the_head_and_in_a_table(tmp_path):
+    page = text_of(write_report(over_angles(), tmp_path / "report.html"))
+    head = page[page.index("Summary") : page.index("Figures of merit")]
+    assert "EX0C 20.00 µm ± 0.61 µm (k = 2)" in head
+    assert "EA0C 0.83 arcsec" in head  # 4 urad
+    table = page[page.index("Figures of merit") : page.index("Error motions")]
+    assert "EX0C 20.00 ± 0.61 µm" in table
+    assert "gain of the sensors 0.300" in table
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_page_over_an_angle_speaks_of_degrees_and_angles(tmp_path):
+    page = text_of(write_report(over_angles(), tmp_path / "report.html"))
+    assert "angle / °" in page
+    assert "Uncertainty budget at angle 345°" in page
+    assert "noise, independent from angle to angle" in page
+    assert "EB: determined at 95.83 % of the places." in page
+    assert "rad" not in page[: page.index("Annex")].replace("grade", "")
+    assert "instant" not in page
+
+
+def test_budgets_of_other_methods_do_not_speak_of_instants():
+    errors = over_angles()
+    made = generic.part(Source(errors), "p1")
+    (table,) = [block for section in made.sections if section.name == "uncertainty" for block in section.blocks][1:]
+    assert any(row[0] == "noise, independent from angle to angle" for row in table.rows)
+
+
+@pytest.mark.parametrize(("limit", "stated"), [(None, False), (3e-6, False), (1.5e-6, True)])
+def test_what_makes_an_uncertainty_large_is_stated(foreign, limit, stated):
+    foreign.limit = limit
+    made = generic.part(Source(over_angles()), "p1")
+    # U = 2 sqrt(0.3^2 + 0.05^2) = 0.608 um: above a third of 1.5 um, below a third of 3 um and half of 20 um.
+    words = (
+        "U of EX0C is 0.61 µm, which is large against its limit 1.50 µm. Its largest source is 'gain of the sensors' "
+        "with 97 % of the variance: a smaller uncertainty of this source would lower it, to 0.10 µm at best."
+    )
+    assert (words in made.summary) == stated
+
+
+@pytest.mark.usefixtures("foreign")
+def test_an_uncertainty_is_compared_with_the_value_without_a_limit():
+    small = generic.part(Source(over_angles(value=1e-6)), "p1")
+    assert any(words.startswith("U of EX0C is 0.61 µm, which is large against its value.") for words in small.summary)
+
+
+def test_a_limit_of_a_campaign_is_that_of_the_figure(foreign):
+    source = Source(over_angles(), limits={"EX*": (-1.5e-6, 1.5e-6)})
+    made = generic.part(source, "p1")
+    assert made.key_figures[0].note == "limit 1.50 µm"
+    assert any("large against its limit 1.50 µm" in words for words in made.summary)
+    assert foreign.limit is None
+
+
+def test_effects_of_sources_follow_from_the_change_of_a_figure(foreign):
+    def figures(errors):
+        return [FigureOfMerit("first", 2 * float(errors["EX"][0]), 2e-6, "m", 3e-6)]
+
+    foreign.figures = figures
+    words = [each for each in generic.part(Source(over_angles()), "p1").summary if each.startswith("U of first")]
+    # The figure is twice an error: 2 * 0.3 um of u = 1 um, 36 % of the variance; the rest is noise.
+    assert "'independent noise' with 64 % of the variance: more readings would lower it, to 1.2 µm at best." in words[0]
+
+
+@pytest.mark.usefixtures("foreign")
+def test_figures_that_cannot_be_computed_do_not_prevent_a_report(foreign, tmp_path):
+    def figures(errors):
+        raise KeyError(errors.attrs["machine"])
+
+    foreign.figures = figures
+    page = text_of(write_report(over_angles(), tmp_path / "report.html"))
+    assert "The figures of merit could not be computed: KeyError: &#39;Five-axis machine&#39;." in page
+    assert "EXC" in page
+
+
+def blocks_of(*parts, errors=None):
+    source = Source(over_angles() if errors is None else errors)
+    return [block for k, part in enumerate(parts) for block in part.blocks(source, f"p{k}")]
+
+
+def test_a_column_has_the_uncertainty_unit_and_reason_of_its_variable():
+    columns = (Column("location", reason="why"), Column("location", "none", "mm", format=".3"), Column("lost"))
+    (table,) = blocks_of(Table("Lines of {component}.", columns, over="line"))
+    assert table.caption == "Lines of C."
+    assert table.head == ["line", "location / µm", "location / mm", "lost"]
+    assert table.rows[0][1] == Cell("+12.0", "2.0")
+    assert table.rows[0][2] == Cell("+0.012")
+    assert table.rows[1][1] == Cell("—", reason="the sphere has moved")
+    assert table.rows[1][3].reason == "not part of this result"
+    made = sheet(table, 1, "lines")
+    assert made.head[:3] == ["line", "location / µm", "U of location / µm"]
+    assert made.rows[0][:3] == ["line 1", 12.0, 2.0]
+
+
+def test_a_column_reduces_the_values_of_a_row():
+    columns = (
+        Column("residual", unit="nm", reduce="rms", format="3", signed=False),
+        Column("EX", reduce="largest", head="EX", signed=False),
+    )
+    (table,) = blocks_of(Table("Residuals.", columns, over="sensor"))
+    assert table.head == ["sensor", "residual / nm", "EX / µm"]
+    assert [row[1].text for row in table.rows] == ["300", "300"]
+    assert table.rows[0][2].text == "20.00"
+
+
+def test_rows_are_places_in_field_units():
+    (table,) = blocks_of(Table("Errors.", (Column("EX"), Column("EA", unit="urad")), over="angle"))
+    assert signs(table.rows[1][0]) == "angle 15°"
+    assert table.head == ["angle", "EXC / µm", "EAC / µrad"]
+    # EX = 20 um cos(30 deg), u^2 = 0.3^2 + 0.05^2; EA = 10 urad sin(15 deg), u = 0.05 urad.
+    assert table.rows[1][1] == Cell("+17.32", "0.61")
+    assert table.rows[1][2] == Cell("+2.59", "0.10")
+
+
+def test_a_part_without_its_variables_is_left_out_or_a_note():
+    assert (
+        blocks_of(Table("Lost.", (Column("lost"),), over="line"), Curves(variables=("lost",)), PolarPlot(over="turn"))
+        == []
+    )
+    (note,) = blocks_of(Table("Lost.", (Column("lost"),), over="line", absent="No value is lost."))
+    assert note.text == "No value is lost."
+
+
+def test_a_unit_that_is_unknown_is_refused():
+    with pytest.raises(ValueError, match="expected one of m, mm, um"):
+        blocks_of(Table("Errors.", (Column("EX", unit="inch"),), over="angle"))
+
+
+def test_curves_state_their_bands_and_spans():
+    (figure,) = blocks_of(Curves())
+    assert "Bands: expanded uncertainty, k = 2." in figure.caption
+    assert "Error motions over angle" in figure.caption
+    assert "EXC −20.00 to 20.00 µm" in figure.alt
+    assert "ECC not observed" in figure.alt
+    assert signs("angle / deg") == "angle / °"
+    assert 'data-x-unit="°"' in figure.svg
+    (plain,) = blocks_of(Curves(band=False))
+    assert "Bands" not in plain.caption
+
+
+def test_a_polar_plot_shows_known_errors_over_a_revolution():
+    (figure,) = blocks_of(PolarPlot(variables=("EX", "EC")))
+    assert figure.alt == "Polar plots: EXC −20.00 to 20.00 µm."
+    # The range of 41.2 um in about five parts: circles at a distance of 10 um.
+    assert ">10 µm<" in figure.svg
+    assert ">270°<" in figure.svg
+
+
+def test_the_curve_of_a_revolution_is_closed_and_that_of_a_part_is_not():
+    def path(errors):
+        (figure,) = blocks_of(PolarPlot(variables=("EX",)), errors=errors)
+        (line,) = re.findall(r'd="(M [^"]*)"[^>]*stroke: #0072b2', figure.svg.replace("#0072B2", "#0072b2"))
+        return line.count("L")
+
+    whole, half = path(over_angles()), path(over_angles().isel(angle=slice(0, 12)))
+    assert (whole, half) == (24, 11)
+
+
+def test_a_map_is_drawn_over_two_dims():
+    errors = build_errors(
+        np.random.default_rng(1).normal(0, 1e-6, (3, 4, 6)),
+        np.broadcast_to(1e-14 * np.eye(6), (3, 4, 6, 6)),
+        dims=("time", "position"),
+        coords={"time": [0.0, 1800.0, 3600.0], "position": [0.0, 0.1, 0.2, 0.3]},
+        component="Y",
+        machine="gantry",
+        frame="machine",
+        functional_point=[0, 0, 0],
+        reference="cold",
+        method="other",
+        method_version="1",
+        provenance={"settings": {}},
+    )
+    (figure,) = blocks_of(Map("The six errors.", x="time", y="position"), errors=errors)
+    assert isinstance(figure, Figure)
+    assert "time / min" in figure.svg
+    assert "position / mm" in figure.svg
+    assert "EXY / µm" in figure.svg
+    assert blocks_of(Map("The six errors.", x="time", y="position"), errors=errors.isel(time=[0])) == []
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_sentence_contains_values_and_is_left_out_if_one_is_missing():
+    source = Source(over_angles())
+    assert Sentence("Axis {component}: {EX0C}.").text(source) == "Axis C: 20.00 ± 0.61 µm."
+    own = {"n": lambda errors: errors.sizes["angle"], "at": Of("EX", select={"angle": 0.0})}
+    assert Sentence("{n} angles, {at}.", own).text(source) == "24 angles, +20.00 ± 0.61 µm."
+    assert Sentence("Lost: {lost}.").text(source) == ""
+    assert Sentence("Never.", when=lambda errors: "lost" in errors).text(source) == ""
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_chapter_is_a_sequence_of_parts():
+    def by_hand(source, key):
+        return [Sentence(f"{key} of {source.key}").blocks(source, key)[0]]
+
+    chapter = Chapter(
+        "Axis {component}",
+        (
+            KeyFigures(("EA*",), units={"rad": "urad"}),
+            Sentence("Measured at {n} angles.", {"n": lambda errors: errors.sizes["angle"]}),
+            Section("budget", "Budget", (FigureBudget(), Own(by_hand))),
+            Section("lost", "Lost", (Table("Lost.", (Column("lost"),), over="line"),)),
+        ),
+    )
+    made = chapter.made(Source(over_angles()), "p3")
+    assert made.title == "Axis C"
+    assert [(each.label, each.value, each.unit) for each in made.key_figures] == [("EA0C", Cell("4.0", "1.0"), "µrad")]
+    assert made.summary[0] == "Measured at 24 angles."
+    assert [section.name for section in made.sections] == ["budget"]
+    assert made.sections[0].blocks[1].text == "p3-budget-1 of p1"
