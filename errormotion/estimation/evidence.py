@@ -1,20 +1,24 @@
-"""Coefficients of series, such as polynomials, whose sizes are estimated from the data as well, by maximum evidence.
+"""Coefficients of series, such as polynomials, whose sizes and smoothness are estimated from the data as well.
 
 The data have been reduced to normal equations ``N x = b``. Columns belong to groups, such as the terms of one error
-motion or of all of one axis. A coefficient of order n in group g has the prior standard deviation ``tau_g n^-p``.
-Columns without group have no prior: known ones, and nuisance parameters, whose own prior is part of N. The sizes tau of
-each group and the common exponent p are those of largest marginal likelihood (MacKay, Bayesian interpolation, Neural
-Computation 4 (1992) 415), for each exponent by expectation and maximisation (Dempster, Laird, Rubin, J. R. Stat. Soc. B
-39 (1977) 1)::
+motion. A coefficient of order n in group g has the prior standard deviation ``tau_g n^-p``. Columns without group have
+no prior: known ones, and nuisance parameters, whose own prior is part of N. For each exponent p, the sizes tau are
+those of largest marginal likelihood (MacKay, Bayesian interpolation, Neural Computation 4 (1992) 415), by expectation
+and maximisation (Dempster, Laird, Rubin, J. R. Stat. Soc. B 39 (1977) 1)::
 
     C = (N + P)^-1,  x = C b,  P = diag(tau_g n^-p)^-2
     tau_g^2 = mean over the group of (x^2 + diag C) n^2p
     2 ln evidence = b' x - ln det (N + P) + ln det P + constant
 
+The data rarely determine the exponent. The estimates of all exponents are therefore averaged with their evidence as
+weight w, and their differences are part of the covariance::
+
+    x = sum w_p x_p,  C = sum w_p (C_p + (x_p - x) (x_p - x)')
+
 Terms that the data do not determine keep their prior, so that their possible size is contained in the covariance. The
-covariance is that for known sizes and exponent. Where few data determine these (25 readings of two polynomials of
-eight orders), 95 % intervals of the curves contain the truth in 80 to 92 % of simulations; with 60 readings in 86 to
-94 %.
+sizes tau are taken as known, which makes intervals somewhat short where few data determine them. Groups of one kind
+have similar sizes: if their logarithms have the standard deviation s, the size of the kind counts as much as
+``1 / (2 s^2)`` terms (`pooled`), since w terms determine ``ln tau`` to ``1 / sqrt(2 w)``.
 """
 
 from __future__ import annotations
@@ -23,20 +27,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from errormotion.arrays import Array
 
 _FIRST_SIZE = 30.0
 """Size of a prior at the start, relative to the typical standard uncertainty of a single column."""
+_NO_WEIGHT = 1e-12
+"""Weight of an exponent that is not counted."""
 _NO_EFFECT = 1e-9
 """Column of which the data know nothing: its size relative to the largest."""
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """Coefficients with their covariance.
+    """Coefficients for one exponent of their prior, with their covariance.
 
     Attributes
     ----------
@@ -67,7 +73,58 @@ class Posterior:
         return np.asarray(self.half.T @ self.half)
 
 
-def maximum_evidence(
+@dataclass(frozen=True)
+class Averaged:
+    """Coefficients averaged over the exponents of their prior, weighted by the evidence.
+
+    Attributes
+    ----------
+    value : ndarray, (column,)
+    covariance : ndarray, (column, column)
+        With the differences between the exponents.
+    within : ndarray, (column, column)
+        Mean of the covariances for each exponent: the effect of nuisance parameters is that of `eliminated` with it.
+    determined : ndarray, (column,)
+        Degree to which the data determine a column, from 0 (by its prior only) to 1.
+    parts : sequence of Posterior
+    weight : ndarray, (part,)
+    """
+
+    value: Array
+    covariance: Array
+    within: Array
+    determined: Array
+    parts: Sequence[Posterior]
+    weight: Array
+
+    @property
+    def exponent(self) -> float:
+        """Mean exponent."""
+        return float(self.weight @ [each.exponent for each in self.parts])
+
+    def variance(self, order: ArrayLike) -> Array:
+        """Return the mean prior variances (group, order) of coefficients of orders (order,)."""
+        n = np.asarray(order, dtype=float)
+        each = [np.outer(part.size**2, n ** (-2 * part.exponent)) for part in self.parts]
+        return np.asarray(np.einsum("p,pgn->gn", self.weight, each))
+
+
+def averaged(parts: Sequence[Posterior]) -> Averaged:
+    """Return coefficients averaged over the exponents."""
+    evidence = np.array([each.evidence for each in parts])
+    weight = np.exp((evidence - evidence.max()) / 2)
+    weight /= weight.sum()
+    value = np.asarray(sum(w * each.value for w, each in zip(weight, parts, strict=True)))
+    within, spread = np.zeros((2, value.size, value.size))
+    for w, each in zip(weight, parts, strict=True):
+        if w > _NO_WEIGHT:
+            within += w * each.covariance
+            spread += w * np.outer(each.value - value, each.value - value)
+    determined = np.asarray(sum(w * each.determined for w, each in zip(weight, parts, strict=True)))
+    return Averaged(value, within + spread, within, determined, parts, weight)
+
+
+def posteriors(
     N: Array,
     b: Array,
     group: NDArray[np.intp],
@@ -80,8 +137,8 @@ def maximum_evidence(
     regularisation: float = 0.0,
     passes: int = 100,
     tolerance: float = 0.01,
-) -> Posterior:
-    """Return the coefficients for the priors of largest evidence.
+) -> list[Posterior]:
+    """Return the coefficients for each exponent, with the sizes of largest evidence.
 
     Parameters
     ----------
@@ -119,7 +176,7 @@ def maximum_evidence(
     typical = [np.median(unit[members[kinds[group[members]] == k]]) for k in range(int(kinds.max(initial=-1)) + 1)]
     search = _Search(scaled, right, unit, members, group[members], np.maximum(order[members], 1.0), kinds,
                      np.array(typical), pooled, smallest, regularisation, passes, tolerance)  # fmt: skip
-    return max((search.with_exponent(p) for p in exponents), key=lambda each: each.evidence)
+    return [search.with_exponent(p) for p in exponents]
 
 
 def eliminated(N: Array, b: Array, square: float, count: int) -> tuple[Array, Array, float, Array]:

@@ -9,6 +9,7 @@ module           content
 ``axes``         linear and rotary axes with their error motions
 ``chains``       the text of a chain, such as ``workpiece-X-Y-bed-Z-spindle-tool``
 ``machines``     machines of any chain: forward model and Jacobian
+``volumes``      errors of the axes from errors of the tool in the volume
 ``description``  one machine tool: chain, travel, spindle axis, rotary axes
 ``beams``        directions of beams and inclinations of surfaces
 ``fits``         geometric least squares: line, plane, circle, sphere, cylinder, cone
@@ -20,7 +21,7 @@ A module is imported when it is first used.
 from importlib import import_module
 from types import ModuleType
 
-__all__ = ["axes", "beams", "chains", "description", "fits", "iso", "machines", "poses", "twists"]
+__all__ = ["axes", "beams", "chains", "description", "fits", "iso", "machines", "poses", "twists", "volumes"]
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -7,7 +7,7 @@ of Y to X.
 
 from __future__ import annotations
 
-__all__ = ["DOF", "LINEAR_AXES", "ROTARY_AXES", "direction_of", "iso_names", "location_names"]
+__all__ = ["DOF", "LINEAR_AXES", "ROTARY_AXES", "direction_of", "is_straightness", "iso_names", "location_names"]
 
 DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
 LINEAR_AXES = ("X", "Y", "Z", "U", "V", "W")
@@ -58,6 +58,11 @@ def direction_of(axis: str) -> int:
         known = ", ".join([*LINEAR_AXES, *ROTARY_AXES, "spindle", *_NO_AXIS])
         raise ValueError(f"expected one of {known}; found '{axis}'")
     return _PARALLEL_TO[axis]
+
+
+def is_straightness(freedom: int, axis: str) -> bool:
+    """Return whether a freedom (0 to 5) is a displacement across an axis."""
+    return freedom < 3 and freedom != direction_of(axis)
 
 
 def location_names(axis: str, others: tuple[str, ...] = LINEAR_AXES) -> dict[str, str]:

@@ -17,7 +17,16 @@ from errormotion.arrays import Array
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
 
-__all__ = ["adjoint", "cross_matrix", "known_product", "move", "to_frame", "transform", "transform_covariance"]
+__all__ = [
+    "adjoint",
+    "cross_matrix",
+    "known_product",
+    "move",
+    "rigid_motions",
+    "to_frame",
+    "transform",
+    "transform_covariance",
+]
 
 # An entry of a rotation matrix smaller than this is rounding of a zero (a quarter turn leaves cos 90 deg = 6e-17).
 ROUNDING_OF_ROTATION = 1e-15
@@ -151,6 +160,19 @@ def transform_covariance(covariance: ArrayLike, A: ArrayLike) -> Array:
         return moved
     affected = ((A != 0).astype(float) @ unknown.astype(float) @ (At != 0).astype(float)) > 0
     return np.where(affected, np.nan, moved)
+
+
+def rigid_motions(points: Array, centre: Array) -> Array:
+    """Return the displacements (n, 3, 6) of points (n, 3), m, by the six motions of a body.
+
+    A motion is a displacement t and a rotation r about ``centre`` (3,): ``t + r x (point - centre)``.
+    """
+    x, y, z = (points - centre).T
+    G = np.zeros((len(points), 3, 6))
+    G[:, 0, 0] = G[:, 1, 1] = G[:, 2, 2] = 1.0
+    G[:, 0, 4], G[:, 0, 5], G[:, 1, 5] = z, -y, x
+    G[:, 1, 3], G[:, 2, 3], G[:, 2, 4] = -z, y, -x
+    return G
 
 
 def move(twist: ArrayLike, shift: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""Coefficients by maximum evidence, against the marginal likelihood of the data, dense algebra, and the truth."""
+"""Coefficients with priors of estimated size, against the marginal likelihood, dense algebra, and the truth."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from numpy.polynomial import legendre
 from scipy import stats
 from scipy.optimize import minimize
 
-from errormotion.estimation.evidence import eliminated, maximum_evidence
+from errormotion.estimation.evidence import averaged, eliminated, posteriors
 
 SIGMA, ORDERS = 0.1, 9
 ORDER = np.concatenate([[0.0], np.arange(1, ORDERS), np.arange(1, ORDERS)])
@@ -36,22 +36,22 @@ def log_likelihood(A, y, size, exponent):
 def test_sizes_and_exponent_are_those_of_the_largest_marginal_likelihood():
     A, _, y = readings(np.random.default_rng(1), (1.0, 0.2), 2.0)
     N, b = normal(A, y)
-    found = maximum_evidence(N, b, GROUP, ORDER, exponents=EXPONENTS, tolerance=1e-8, passes=5000)
+    found = {
+        each.exponent: each for each in posteriors(N, b, GROUP, ORDER, exponents=EXPONENTS, tolerance=1e-8, passes=5000)
+    }
     best = {}
     for p in EXPONENTS:
         wanted = minimize(lambda logs, p=p: -log_likelihood(A, y, np.exp(logs), p), [0.0, -1.0], method="Nelder-Mead")
         best[p] = -wanted.fun
-    assert found.exponent == max(best, key=lambda p: best[p])
-    for p in EXPONENTS:
-        of_p = maximum_evidence(N, b, GROUP, ORDER, exponents=[p], tolerance=1e-8, passes=5000)
-        assert log_likelihood(A, y, of_p.size, p) == pytest.approx(best[p], abs=1e-3)
-        assert found.evidence - of_p.evidence == pytest.approx(2 * (best[found.exponent] - best[p]), abs=4e-3)
+    for p, each in found.items():
+        assert log_likelihood(A, y, each.size, p) == pytest.approx(best[p], abs=1e-3)
+        assert each.evidence - found[1.0].evidence == pytest.approx(2 * (best[p] - best[1.0]), abs=4e-3)
 
 
 def test_coefficients_are_those_of_the_posterior():
     A, _, y = readings(np.random.default_rng(2), (1.0, 0.2), 2.0)
     N, b = normal(A, y)
-    found = maximum_evidence(N, b, GROUP, ORDER, exponents=[2.0], tolerance=1e-10, passes=5000)
+    [found] = posteriors(N, b, GROUP, ORDER, exponents=[2.0], tolerance=1e-10, passes=5000)
     precision = np.concatenate([[0.0], (np.repeat(found.size, ORDERS - 1) * ORDER[1:] ** -2.0) ** -2])
     C = np.linalg.inv(N + np.diag(precision))
     u = np.sqrt(np.diag(C))
@@ -66,7 +66,7 @@ def test_intervals_contain_the_true_curve_if_the_data_determine_the_sizes():
     P = legendre.legvander(np.linspace(-1, 1, 21), ORDERS - 1)[:, 1:]
     for _ in range(count):
         A, x, y = readings(rng, (10.0, 5.0), 1.0)
-        found = maximum_evidence(*normal(A, y), GROUP, ORDER, exponents=EXPONENTS)
+        found = averaged(posteriors(*normal(A, y), GROUP, ORDER, exponents=EXPONENTS))
         for g in range(2):
             some = np.flatnonzero(g == GROUP)
             u = np.sqrt(np.einsum("ij,jk,ik->i", P, found.covariance[np.ix_(some, some)], P))
@@ -75,14 +75,37 @@ def test_intervals_contain_the_true_curve_if_the_data_determine_the_sizes():
     assert 0.93 <= np.mean(held) <= 0.97
 
 
+def test_the_average_has_the_moments_of_draws_from_all_exponents():
+    A, _, y = readings(np.random.default_rng(8), (1.0, 0.2), 2.0, count=25)
+    parts = posteriors(*normal(A, y), GROUP, ORDER, exponents=(1.5, 2.0, 2.5))
+    found = averaged(parts)
+    assert found.weight.sum() == pytest.approx(1.0)
+    assert found.weight.max() < 0.9
+    assert np.diff(np.log(found.weight)) == pytest.approx(np.diff([each.evidence for each in parts]) / 2)
+    rng, draws = np.random.default_rng(9), 40_000
+    which = rng.choice(3, draws, p=found.weight)
+    z = rng.normal(size=(draws, len(ORDER)))
+    x = np.array([each.value for each in parts])[which] + np.einsum(
+        "dij,di->dj", np.array([each.half for each in parts])[which], z
+    )
+    u = np.sqrt(np.diag(found.covariance))
+    assert x.mean(axis=0) == pytest.approx(found.value, abs=5 * u.max() / np.sqrt(draws))
+    # a variance of draws from nearly normal distributions has the relative standard deviation sqrt(2 / draws)
+    assert x.std(axis=0) == pytest.approx(u, rel=5 * np.sqrt(1 / (2 * draws)))
+    expected = sum(
+        w * each.size[1] ** 2 * 5.0 ** (-2 * each.exponent) for w, each in zip(found.weight, parts, strict=True)
+    )
+    assert found.variance([4, 5])[1, 1] == pytest.approx(expected)
+
+
 def test_units_have_no_effect():
     A, _, y = readings(np.random.default_rng(4), (1.0, 0.2), 2.0)
     scale = np.where(GROUP == 1, 1e6, 1.0) * np.where(GROUP < 0, 1e-3, 1.0)
     one, other = (
-        maximum_evidence(*normal(A * s, y), GROUP, ORDER, exponents=EXPONENTS) for s in (np.ones(len(ORDER)), scale)
+        averaged(posteriors(*normal(A * s, y), GROUP, ORDER, exponents=EXPONENTS)) for s in (np.ones(len(ORDER)), scale)
     )
     assert other.value * scale == pytest.approx(one.value, rel=1e-9)
-    assert other.size * [1.0, 1e6] == pytest.approx(one.size, rel=1e-9)
+    assert other.parts[1].size * [1.0, 1e6] == pytest.approx(one.parts[1].size, rel=1e-9)
 
 
 def test_an_undetermined_coefficient_keeps_its_prior():
@@ -91,7 +114,7 @@ def test_an_undetermined_coefficient_keeps_its_prior():
     A = A.copy()
     A[:, GROUP == 1] = 0.0
     N, b = normal(A, y)
-    found = maximum_evidence(
+    [found] = posteriors(
         N, b, GROUP, ORDER, exponents=[2.0], kind=np.zeros(2, dtype=np.intp), pooled=1.0, passes=3000, tolerance=1e-9,
         regularisation=1e-13,
     )  # fmt: skip
@@ -107,7 +130,7 @@ def test_an_undetermined_coefficient_keeps_its_prior():
 def test_a_size_is_not_smaller_than_the_smallest():
     A, _, y = readings(np.random.default_rng(6), (0.0, 0.0), 2.0)
     N, b = normal(A, y)
-    found = maximum_evidence(N, b, GROUP, ORDER, exponents=[2.0], smallest=5.0, passes=1000)
+    [found] = posteriors(N, b, GROUP, ORDER, exponents=[2.0], smallest=5.0, passes=1000)
     single = 1 / np.sqrt(np.diag(N))
     least = [5.0 * np.median(single[g == GROUP]) for g in range(2)]
     assert found.size == pytest.approx(least, rel=1e-9)

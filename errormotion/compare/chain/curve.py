@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.results.reduction import influence_of
 from errormotion.estimation.low_rank import root_of
-from errormotion.kinematics.iso import direction_of
+from errormotion.kinematics.iso import is_straightness
 
 REFERENCE = "reference position"
 """Group of the sources from the uncertainty of the errors at the reference positions."""
@@ -80,11 +80,6 @@ def reference_weights(values: Sequence[Array], positions: Array, axis: str) -> A
         W[:, a, dof] = 1.0 - share
         W[:, z, dof] += share
     return W
-
-
-def is_straightness(dof: int, axis: str) -> bool:
-    """Return whether a freedom is a displacement across the axis."""
-    return dof < 3 and dof != direction_of(axis)
 
 
 def sources_of(ds: xr.Dataset) -> tuple[list[str], list[str], list[str]]:

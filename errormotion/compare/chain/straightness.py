@@ -14,11 +14,11 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array, filled
-from errormotion.compare.chain.curve import Curve, is_straightness, reference_weights
+from errormotion.compare.chain.curve import Curve, reference_weights
 from errormotion.compare.placed import Placed
 from errormotion.datasets.schemas import STRAIGHTNESS_REFERENCES
 from errormotion.kinematics import twists
-from errormotion.kinematics.iso import DOF, LINEAR_AXES, direction_of
+from errormotion.kinematics.iso import DOF, LINEAR_AXES, direction_of, is_straightness
 
 ATTRIBUTE = "straightness_reference"
 TABLE, TOOL = STRAIGHTNESS_REFERENCES

@@ -23,7 +23,7 @@ class Multilateration:
         id="multilateration",
         summary="Volumetric error and the errors of three axes from tracker distances, stations and dead paths unknown",
         status="simulated_only",
-        version="3",
+        version="4",
         cannot_see=(
             "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",

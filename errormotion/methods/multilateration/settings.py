@@ -248,7 +248,7 @@ class Settings(PluginSettings):
         description="bodies of the machine, such as workpiece-X-Y-bed-Z-spindle-tool, where the data do not state it",
     )
     parametric: bool = Field(default=True, description="error motions of the axes from the errors of the targets")
-    max_order: int = Field(default=8, ge=1, le=15, description="highest order of the polynomials of an error motion")
+    max_order: int = Field(default=12, ge=1, le=15, description="highest order of the polynomials of an error motion")
     station_tolerance: Length = Field(
         default=0.1, gt=0, description="distance of a station from its approximate position above which a note is given"
     )

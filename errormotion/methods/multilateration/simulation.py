@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
-from errormotion.kinematics.twists import cross_matrix, move
+from errormotion.kinematics.twists import move, rigid_motions
 from errormotion.methods.multilateration.names import station_names, target_names
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.twin import VirtualMachine, truth
@@ -112,8 +112,7 @@ def true_errors(
         twist = twist + machine.thermal_twist(q, time)
     twist = move(twist, at)
     point = q + at
-    lever = point - point.mean(axis=0)
-    G = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -cross_matrix(lever)], axis=2)
+    G = rigid_motions(point, point.mean(axis=0))
     motion = np.linalg.lstsq(G.reshape(-1, 6), twist[:, :3].ravel())[0]
     twist[:, :3] -= G @ motion
     twist[:, 3:] -= motion[3:]

@@ -8,7 +8,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import cross_matrix, move
 from errormotion.methods.multilateration import simulation
-from errormotion.methods.multilateration.identification.parameters import fit_machine
+from errormotion.methods.multilateration.identification.parameters import fit_machine, misfit_note, reference_of
 from errormotion.twin import VirtualMachine
 
 REFLECTOR = np.array([0.02, -0.01, -0.08])
@@ -50,7 +50,7 @@ def test_curves_agree_with_the_true_ones_within_their_uncertainty(kind):
         machine, q, at, error, own, none = targets(seed, kind=kind)
         axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
         for k, axis in enumerate("XYZ"):
-            position = np.linspace(axes.chain.low[k], axes.chain.high[k], 21)
+            position = np.linspace(axes.volume.low[k], axes.volume.high[k], 21)
             for name in (dof + axis for dof in DOF):
                 if name not in axes.undetermined:
                     value, u = axes.curve(name, position)
@@ -64,7 +64,7 @@ def test_squareness_is_that_of_the_mean_lines():
     found = []
     for count in ((9, 9, 9), (8, 7, 9)):
         machine, q, at, error, own, none = targets(3, count, noise=1e-9)
-        found.append(fit_machine(machine.chain, q, error, own, none, reflector=at, max_order=8).squareness())
+        found.append(fit_machine(machine.chain, q, error, own, none, reflector=at, max_order=8).locations())
     for name in ("EC0Y", "EA0Z", "EB0Z"):
         (a, u), (b, v) = found[0][name], found[1][name]
         assert abs(a - b) < 4 * np.hypot(u, v)
@@ -77,10 +77,10 @@ def test_a_single_squareness_is_determined_without_other_errors():
     errors = np.array(list(wanted.values()))
     error = machine.geometry.machine.volumetric_error(q, errors, REFLECTOR)[:, :3]
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
-    for name, (value, u) in axes.squareness().items():
+    for name, (value, u) in axes.locations().items():
         assert value == pytest.approx(wanted[name], abs=1e-9)
         assert u < 1e-6
-    x = np.linspace(*axes.chain.low[:1], *axes.chain.high[:1], 5)
+    x = np.linspace(*axes.volume.low[:1], *axes.volume.high[:1], 5)
     assert np.abs(axes.curve("EYX", x)[0]).max() < 1e-9
 
 
@@ -101,9 +101,9 @@ def test_three_reflectors_determine_all_21():
     axes = fit_machine(machine.chain, q, error, own, none, reflector=at)
     assert not axes.undetermined
     assert len({term.error for term in axes.terms}) == 21
-    z = np.linspace(axes.chain.low[2], axes.chain.high[2], 9)
+    z = np.linspace(axes.volume.low[2], axes.volume.high[2], 9)
     value, u = axes.curve("ECZ", z)
-    truth = true_curve(machine, "ECZ", z, axes.chain.reference)
+    truth = true_curve(machine, "ECZ", z, reference_of(axes))
     assert np.all(np.abs(value - truth) < 4 * u)
     assert np.ptp(truth) > 4 * u.mean()
 
@@ -124,7 +124,7 @@ def test_the_uncertainty_of_the_scale_affects_positioning_but_not_straightness()
     unsure = fit_machine(machine.chain, q, error, own, scale, reflector=at)
 
     def end(axes, name):
-        return axes.curve(name, axes.chain.high[:1])[1][0]
+        return axes.curve(name, axes.volume.high[:1])[1][0]
 
     half = np.ptp(q[:, 0]) / 2
     assert end(unsure, "EXX") == pytest.approx(np.hypot(end(plain, "EXX"), 5e-6 * half), rel=0.05)
@@ -137,9 +137,9 @@ def test_errors_that_no_axis_explains_increase_the_uncertainty():
     odd[:, 0] += 5e-6 * np.sign(np.sin(97 * q @ np.array([1.0, 2.0, 3.0])))  # no chain of axes does this
     plain, bent = (fit_machine(machine.chain, q, e, own, none, reflector=at) for e in (error, odd))
     assert bent.sigma0 > 3
-    assert "not rigid" in bent.notes[0]
-    assert not plain.notes
-    assert bent.squareness()["EC0Y"][1] > 3 * plain.squareness()["EC0Y"][1]
+    assert "not rigid" in misfit_note(bent, 12)[0]
+    assert not misfit_note(plain, 12)
+    assert bent.locations()["EC0Y"][1] > 3 * plain.locations()["EC0Y"][1]
 
 
 def test_unknown_targets_are_ignored():

@@ -6,8 +6,9 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2, norm
 
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
-from errormotion.methods.multilateration.network.model import Stations, jacobian, motions, readings
+from errormotion.methods.multilateration.network.model import Stations, jacobian, readings
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning.bound import bound, relative_bound
 
@@ -44,7 +45,7 @@ def dense_covariance(target, station, weight, in_datum):
     centre = target.mean(axis=0)
     size = np.sqrt(np.mean((target - centre) ** 2))
     G = np.zeros((3 * m + 4 * n, 6))
-    G[: 3 * m] = motions(target, centre).reshape(3 * m, 6) / [1, 1, 1, size, size, size]
+    G[: 3 * m] = rigid_motions(target, centre).reshape(3 * m, 6) / [1, 1, 1, size, size, size]
     G[: 3 * m][np.repeat(~in_datum, 3)] = 0.0
     # Scaled to one, so that the bordered matrix loses no digits.
     s = np.linalg.norm(J)

@@ -7,9 +7,9 @@ import pytest
 
 from errormotion import datasets
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration import Multilateration
 from errormotion.methods.multilateration.identification.parameters import fit_machine
-from errormotion.methods.multilateration.network.model import motions
 from errormotion.methods.multilateration.network.solver import solve
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
@@ -74,7 +74,7 @@ def test_the_prediction_for_a_further_target_is_the_scatter_of_measurements():
     chosen = np.array(v.choose(20, "largest"))
     place = GRID + REFLECTOR
     d = np.linalg.norm(place - STATIONS[:, None], axis=2)
-    G = motions(place, place.mean(axis=0)).reshape(-1, 6)
+    G = rigid_motions(place, place.mean(axis=0)).reshape(-1, 6)
     rng = np.random.default_rng(2)
     off = []
     for _ in range(200):
@@ -101,7 +101,7 @@ def test_the_prediction_for_the_axes_is_the_scatter_of_fits():
     chosen = np.array(v.choose(40, "mean"))
     expected = Expected.of(CHAIN, GRID, REFLECTOR, 4, 10e-6, 20e-6)
     place = GRID + REFLECTOR
-    G = motions(place, place.mean(axis=0)).reshape(-1, 6)
+    G = rigid_motions(place, place.mean(axis=0)).reshape(-1, 6)
     rng = np.random.default_rng(3)
     off = []
     for _ in range(25):
@@ -115,7 +115,7 @@ def test_the_prediction_for_the_axes_is_the_scatter_of_fits():
             CHAIN, GRID[chosen], network.target - place[chosen], own, factor.transpose(2, 0, 1),
             reflector=np.tile(REFLECTOR, (len(chosen), 1)), max_order=4,
         )  # fmt: skip
-        found = axes.chain.columns(axes.terms, GRID, np.tile(REFLECTOR, (len(GRID), 1))) @ axes.coefficient
+        found = axes.volume.columns(axes.terms, GRID, np.tile(REFLECTOR, (len(GRID), 1))) @ axes.coefficient
         change = (found - true).ravel()
         off.append((change - G @ np.linalg.lstsq(G, change)[0]).reshape(place.shape))
     scatter = np.sqrt((np.array(off) ** 2).sum(axis=2).mean())

@@ -147,10 +147,11 @@ def estimate_drift(
 
 def _visits(position: NDArray[np.intp], known: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """Return the known targets of each position that has more than one."""
-    targets = np.flatnonzero(known)
+    again = np.bincount(position[known], minlength=position.max(initial=-1) + 1) > 1
+    targets = np.flatnonzero(known & again[position])
     targets = targets[np.argsort(position[targets], kind="stable")]
     groups = np.split(targets, np.flatnonzero(np.diff(position[targets])) + 1)
-    return [group for group in groups if len(group) > 1]
+    return [group for group in groups if len(group)]
 
 
 def _within(groups: list[NDArray[np.intp]], d: Array, terms: Array, noise: Array) -> tuple[Array, Array]:

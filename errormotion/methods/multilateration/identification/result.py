@@ -17,7 +17,7 @@ from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.identification import uncertainty
-from errormotion.methods.multilateration.identification.parameters import Parametric, fit_machine
+from errormotion.methods.multilateration.identification.parameters import fit_machine, misfit_note
 from errormotion.methods.multilateration.identification.state import State
 from errormotion.methods.multilateration.identification.volume import parametric_extras, parametric_labels
 from errormotion.methods.multilateration.network.alternating import alternate
@@ -26,6 +26,7 @@ from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from errormotion.kinematics.volumes import AxisErrors
     from errormotion.methods.multilateration.identification.uncertainty import Parts
 
 log = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ def _uncertainty(state: State) -> Parts:
     return parts
 
 
-def _axes(state: State, error: Array, parts: Parts) -> Parametric | None:
+def _axes(state: State, error: Array, parts: Parts) -> AxisErrors | None:
     """Return the errors of the axes; if they are not determined, a note states the reason."""
     data, settings, notes = state.data, state.settings, state.notes
     if not settings.parametric:
@@ -132,7 +133,7 @@ def _axes(state: State, error: Array, parts: Parts) -> Parametric | None:
     except MethodError as refusal:
         notes.append(f"No errors of the axes. {refusal}")
         return None
-    notes.extend(axes.notes)
+    notes.extend(misfit_note(axes, settings.max_order))
     if axes.undetermined:
         reasons = "; ".join(f"{name}: {each.reason}" for name, each in axes.undetermined.items())
         notes.append(f"Errors of the axes that these targets do not determine: {reasons}.")

@@ -11,7 +11,8 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
 from errormotion.estimation.low_rank import root_of
-from errormotion.methods.multilateration.identification.parameters import AXES, Chain, Parametric, Term, Undetermined
+from errormotion.kinematics.volumes import AxisErrors, Term, Undetermined, Volume
+from errormotion.methods.multilateration.identification.parameters import AXES, reference_of, volume_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -23,7 +24,7 @@ CURVE_POINTS = 41
 _DOFS = 6
 
 
-def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
+def parametric_extras(axes: AxisErrors) -> dict[str, xr.DataArray]:
     """Return the errors of the axes as variables of an error dataset.
 
     ``EXX(X_position)`` ... and ``EXX_u``: error motions and standard uncertainties, NaN if not determined, with the
@@ -32,10 +33,10 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     `volumetric_errors`. Their coordinates are `parametric_labels`.
     """
     extras: dict[str, xr.DataArray] = {}
-    chain = axes.chain
+    volume = axes.volume
     includes = _includes(axes.undetermined)
-    for k, (dim, q) in enumerate(_curve_positions(chain).items()):
-        for error in chain.machine.error_names[6 * k : 6 * k + 6]:
+    for k, (dim, q) in enumerate(_curve_positions(volume).items()):
+        for error in volume.motions[6 * k : 6 * k + 6]:
             unit = _unit(error)
             attrs = {
                 "units": unit, "order": axes.orders.get(error, 0), "unseen": _reason(axes, error),
@@ -44,24 +45,29 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
             value, u = axes.curve(error, q)
             extras[error] = xr.DataArray(value, dims=dim, attrs=attrs)
             extras[f"{error}_u"] = xr.DataArray(u, dims=dim, attrs={"units": unit})
-    for error, (number, uncertainty) in axes.squareness().items():
+    for error, (number, uncertainty) in axes.locations().items():
         attrs = {"units": "rad", "unseen": _reason(axes, error), "includes": includes.get(error, "")}
         extras[error] = xr.DataArray(number, attrs=attrs)
         extras[f"{error}_u"] = xr.DataArray(uncertainty, attrs={"units": "rad"})
     reasons = [f"{name}: {each.reason}" for name, each in axes.undetermined.items()]
-    attrs_of_terms = {"chain": chain.machine.chain, "unseen": reasons or [""]}
+    attrs_of_terms = {"chain": volume.machine.chain, "unseen": reasons or [""]}
     extras["coefficient"] = xr.DataArray(axes.coefficient, dims="term", attrs=attrs_of_terms)
     extras["coefficient_covariance"] = xr.DataArray(axes.covariance, dims=("term", "term_"))
     extras["determined"] = xr.DataArray(
         axes.determined, dims="term", attrs={"units": "1", "long_name": "1: by the targets, 0: by the prior"}
     )
     extras["axes_datum"] = xr.DataArray(axes.datum, dims=("motion", "term"))
+    rest = np.zeros((len(volume.motions), max(map(len, axes.rest.values()))))
+    for motion, variance in axes.rest.items():
+        rest[volume.motions.index(motion)] = variance
+    meaning = {"long_name": "variance of the coefficients above the fitted orders, m^2 or rad^2"}
+    extras["axes_rest"] = xr.DataArray(rest, dims=("error_motion", "rest_order"), attrs=meaning)
     m = {"units": "m"}
     for name, vector in {
         "axes_centre": axes.centre,
-        "axes_reference": chain.reference,
-        "axes_low": chain.low,
-        "axes_high": chain.high,
+        "axes_reference": reference_of(axes),
+        "axes_low": volume.low,
+        "axes_high": volume.high,
     }.items():
         extras[name] = xr.DataArray(vector, dims="direction", attrs=m)
     extras["axes_sigma0"] = xr.DataArray(axes.sigma0, attrs={"units": "1"})
@@ -69,22 +75,23 @@ def parametric_extras(axes: Parametric) -> dict[str, xr.DataArray]:
     return extras
 
 
-def parametric_labels(axes: Parametric) -> dict[str, Any]:
+def parametric_labels(axes: AxisErrors) -> dict[str, Any]:
     """Return the coordinates of the variables by `parametric_extras`: name to (dims, values, attributes)."""
     return {
-        **{dim: (dim, q, {"units": "m"}) for dim, q in _curve_positions(axes.chain).items()},
+        **{dim: (dim, q, {"units": "m"}) for dim, q in _curve_positions(axes.volume).items()},
         "term_error": ("term", [term.error for term in axes.terms], {}),
         "term_order": ("term", [term.order for term in axes.terms], {}),
+        "error_motion": ("error_motion", list(axes.volume.motions), {}),
     }
 
 
-def _curve_positions(chain: Chain) -> dict[str, Array]:
+def _curve_positions(volume: Volume) -> dict[str, Array]:
     """Return the positions of each axis at which its errors are tabulated, m, by the name of the dimension."""
-    ends = zip(AXES, chain.low, chain.high, strict=True)
+    ends = zip(AXES, volume.low, volume.high, strict=True)
     return {f"{axis}_position": np.linspace(low, high, CURVE_POINTS) for axis, low, high in ends}
 
 
-def _reason(axes: Parametric, error: str) -> str:
+def _reason(axes: AxisErrors, error: str) -> str:
     return axes.undetermined[error].reason if error in axes.undetermined else ""
 
 
@@ -97,7 +104,7 @@ def _includes(undetermined: Mapping[str, Undetermined]) -> dict[str, str]:
     return {name: f"the effect of {' and '.join(others)} at the reflector" for name, others in included.items()}
 
 
-def axes_of(errors: xr.Dataset) -> Parametric:
+def axes_of(errors: xr.Dataset) -> AxisErrors:
     """Return the errors of the axes in a dataset of this method.
 
     Raises
@@ -115,13 +122,14 @@ def axes_of(errors: xr.Dataset) -> Parametric:
     terms = [Term(str(error), int(order)) for error, order in pairs]
     vector = {name: np.asarray(errors[f"axes_{name}"].values, dtype=float) for name in
               ("centre", "reference", "low", "high")}  # fmt: skip
-    model = Chain.of(str(c.attrs["chain"]), np.stack([vector["low"], vector["high"]]), vector["reference"][None])
-    reasons = {name: str(errors[name].attrs.get("unseen", "")) for name in model.machine.error_names}
+    volume = volume_of(str(c.attrs["chain"]), np.stack([vector["low"], vector["high"]]), vector["reference"][None])
+    reasons = {name: str(errors[name].attrs.get("unseen", "")) for name in volume.machine.error_names}
     undetermined = {name: Undetermined(reason) for name, reason in reasons.items() if reason}
-    covariance, datum = errors["coefficient_covariance"].values, errors["axes_datum"].values
-    return Parametric(
-        model, terms, c.values, covariance, errors["determined"].values, undetermined, float(errors["axes_sigma0"]),
-        float(errors["axes_freedom"]), datum, vector["centre"],
+    rest = errors["axes_rest"].values if "axes_rest" in errors else np.zeros((len(volume.motions), 0))
+    return AxisErrors(
+        volume, terms, c.values, errors["coefficient_covariance"].values, np.zeros((len(terms), 0)),
+        dict(zip(volume.motions, rest, strict=True)), errors["determined"].values, undetermined, float("nan"),
+        float(errors["axes_sigma0"]), 1.0, float(errors["axes_freedom"]), errors["axes_datum"].values, vector["centre"],
     )  # fmt: skip
 
 
@@ -141,8 +149,8 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     Returns
     -------
     Dataset
-        Error dataset over ``target`` in the datum of ``errors``, with the covariance by that of the coefficients, whose
-        parts are the sources of ``influence``.
+        Error dataset over ``target`` in the datum of ``errors``. The parts of the covariance of the coefficients are
+        the sources of ``influence``; the covariance also contains the orders that were not fitted.
 
     Raises
     ------
@@ -153,17 +161,18 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     q = np.atleast_2d(np.asarray(position, dtype=float))
     if q.ndim != 2 or q.shape[1] != 3 or not np.isfinite(q).all():
         raise MethodError(f"position: expected finite axis positions (k, 3) in m; found shape {q.shape}, or NaN")
-    at = axes.chain.reference if tool is None else np.asarray(tool, dtype=float)
+    at = reference_of(axes) if tool is None else np.asarray(tool, dtype=float)
     A = _field(axes, q, at)
     values = A @ axes.coefficient
-    unknown = ~(_known_dofs(axes, q, at) & _inside(axes, q)[:, None])
+    inside = axes.volume.inside(q)
+    unknown = ~(_known_dofs(axes, q, at) & inside[:, None])
     root = root_of(axes.covariance, smallest=1e-14)
     influence = np.moveaxis(A @ root, 2, 0)
     values[unknown] = np.nan
     influence[:, unknown] = np.nan
-    covariance = np.einsum("ska,skb->kab", influence, influence)
+    covariance = np.einsum("ska,skb->kab", influence, influence) + _rest(axes, q, at)
     notes = []
-    if outside := int(np.count_nonzero(~_inside(axes, q))):
+    if outside := int(np.count_nonzero(~inside)):
         notes.append(f"{outside} of {len(q)} positions are outside the measured volume: their errors are unknown.")
     attrs = errors.attrs
     ds = build_errors(
@@ -207,28 +216,35 @@ def _unit(error: str) -> str:
     return "m" if error[1] in AXES else "rad"
 
 
-def _inside(axes: Parametric, q: Array) -> NDArray[np.bool_]:
-    low, high = axes.chain.low, axes.chain.high
-    return np.asarray(((q >= low - 1e-9) & (q <= high + 1e-9)).all(axis=1), dtype=bool)
-
-
-def _field(axes: Parametric, q: Array, tool: Array) -> Array:
+def _field(axes: AxisErrors, q: Array, tool: Array) -> Array:
     """Return the derivative of the twists by the coefficients, (k, 6, term), in the datum."""
-    A = axes.chain.columns(axes.terms, q, np.tile(tool, (len(q), 1)), _DOFS)
-    A[:, :3] -= axes.chain.motions(q + tool, axes.centre) @ axes.datum
+    at = np.tile(tool, (len(q), 1))
+    A = axes.volume.columns(axes.terms, q, at, _DOFS)
+    A[:, :3] -= axes.volume.wholes(q, at, axes.centre) @ axes.datum
     A[:, 3:] -= axes.datum[3:]
     return A
 
 
-def _known_dofs(axes: Parametric, q: Array, tool: Array) -> NDArray[np.bool_]:
+def _rest(axes: AxisErrors, q: Array, tool: Array) -> Array:
+    """Return the covariance (k, 6, 6) of the twists by the orders of the error motions that were not fitted."""
+    J = axes.volume.machine.jacobian(q, tool)
+    found = np.zeros((len(q), _DOFS, _DOFS))
+    for k, motion in enumerate(axes.volume.motions):
+        if motion not in axes.undetermined and len(axes.rest[motion]):
+            variance = axes.rest_at(motion, q[:, axes.volume.axis(motion)])
+            found += variance[:, None, None] * J[:, :, k, None] * J[:, None, :, k]
+    return found
+
+
+def _known_dofs(axes: AxisErrors, q: Array, tool: Array) -> NDArray[np.bool_]:
     """Return whether each freedom is known, (k, 6).
 
     Displacements at the position of the reflector are known: errors that are not distinguishable have the same effect
     there. Elsewhere, and for rotations, every error with an effect must be determined.
     """
-    J = axes.chain.machine.jacobian(q, tool)
-    undetermined = [axes.chain.machine.error_names.index(name) for name in axes.undetermined]
+    J = axes.volume.machine.jacobian(q, tool)
+    undetermined = [axes.volume.machine.error_names.index(name) for name in axes.undetermined]
     known = np.asarray((J[:, :, undetermined] == 0).all(axis=2), dtype=bool)
-    if np.allclose(tool, axes.chain.reference, rtol=0, atol=1e-9):
+    if np.allclose(tool, reference_of(axes), rtol=0, atol=1e-9):
         known[:, :3] = True
     return known

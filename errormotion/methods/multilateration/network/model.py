@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.kinematics.twists import rigid_motions
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -43,7 +44,7 @@ class Stations:
         """Return the effect (4 n + k, 6) of rigid motions of the network (t, r about ``centre``) on the parameters."""
         n = len(self.position)
         T = np.zeros((4 * n + len(self.value), 6))
-        T[: 4 * n].reshape(n, 4, 6)[:, :3] = motions(self.position, centre)
+        T[: 4 * n].reshape(n, 4, 6)[:, :3] = rigid_motions(self.position, centre)
         return T
 
     def complement(self, centre: Array, free: NDArray[np.bool_]) -> Array:
@@ -53,16 +54,6 @@ class Stations:
         Z = np.zeros((len(free), len(T) - 6))
         Z[free] = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
         return Z
-
-
-def motions(positions: Array, centre: Array) -> Array:
-    """Return G (n, 3, 6): the displacement of positions (n, 3) by a rigid motion t + r x (position - ``centre``)."""
-    x, y, z = (positions - centre).T
-    G = np.zeros((len(positions), 3, 6))
-    G[:, 0, 0] = G[:, 1, 1] = G[:, 2, 2] = 1.0
-    G[:, 0, 4], G[:, 0, 5], G[:, 1, 5] = z, -y, x
-    G[:, 1, 3], G[:, 2, 3], G[:, 2, 4] = -z, y, -x
-    return G
 
 
 def readings(target: Array, stations: Stations, extra: Array | None = None) -> Array:

@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.network import target_sums
-from errormotion.methods.multilateration.network.model import Stations, directions, motions
+from errormotion.methods.multilateration.network.model import Stations, directions
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,7 @@ class Network:
         q = -np.einsum("jta,jap->jtp", e, W[:, :3]) - W[:, None, 3]
         if len(self.extra):
             q = q + np.einsum("kjt,kp->jtp", self.extra[:, :, targets], self.datum.factor[4 * n :])
-        G = motions(u, self.datum.centre)
+        G = rigid_motions(u, self.datum.centre)
         factor = -own @ np.einsum("jt,jta,jtp->tap", w**2, e, q) - G @ self.datum.shift
         return own, factor, G
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.model import motions
+from errormotion.kinematics.twists import rigid_motions
 
 FLAT = 1e-13
 """Determinant of the directions' products over the cube of their trace below which a target is not moved."""
@@ -139,7 +139,7 @@ def datum_sums(
     weight, extra, target = weight[:, in_datum], extra[:, :, in_datum], target[in_datum]
     e, D, whole = seen(weight, station, target)
     weight, extra, target, e, D = weight[:, whole], extra[:, :, whole], target[whole], e[:, :, whole], D[:, :, whole]
-    G = motions(target, centre)
+    G = rigid_motions(target, centre)
     own = weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e)
     F = response(own, e)
     if len(extra):
@@ -178,7 +178,7 @@ def examine(
     hat = np.einsum("mja,mab,mjb->jm", E, own, E)
     taken = np.einsum("mjp,mjp->jm", left := q + E @ F, left)
     redundancy = np.where(whole & (weight > 0), 1.0 - hat - taken, np.nan)
-    G = motions(target, centre)
+    G = rigid_motions(target, centre)
     F = F - G @ shift
     DG = np.where(in_datum[:, None, None], own @ G, 0.0)
     # (1/2 G K - D G H) G^T and its transpose are the terms of the datum.

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.network import target_sums
 from errormotion.methods.multilateration.network.descent import State
 from errormotion.methods.multilateration.network.diagnosis import determinacy
 from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets
-from errormotion.methods.multilateration.network.model import Stations, motions, readings
+from errormotion.methods.multilateration.network.model import Stations, readings
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.problem import state_problem
 from errormotion.methods.multilateration.network.solver import conclude
@@ -86,7 +87,8 @@ def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array
     n, centre = len(station), target[used].mean(axis=0)
     stations = Stations(station, np.zeros(n), np.zeros(0))
     Z = stations.complement(centre, np.ones(4 * n, dtype=bool))
-    G, F = motions(target, centre), target_sums.response(weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e), e)
+    G = rigid_motions(target, centre)
+    F = target_sums.response(weight[:, None] ** 2 * np.einsum("abm,jbm->jam", D, e), e)
     flat = G[used].reshape(-1, 6)
     H = np.linalg.inv(flat.T @ flat)
     shift = H @ (flat.T @ F[used].reshape(len(flat), -1))

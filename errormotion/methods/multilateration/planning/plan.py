@@ -12,10 +12,10 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.identification.refraction import index_uncertainty, sensitivities
 from errormotion.methods.multilateration.identification.uncertainty import Scatter
 from errormotion.methods.multilateration.names import station_names, target_names
-from errormotion.methods.multilateration.network.model import motions
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.methods.multilateration.planning.sight import Sight
@@ -263,7 +263,7 @@ def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[st
 
 def _without_motion(change: Array, target: Array) -> Array:
     """Return a change (m, 3) of the targets minus its best-fit rigid motion."""
-    G = motions(target, target.mean(axis=0)).reshape(-1, 6)
+    G = rigid_motions(target, target.mean(axis=0)).reshape(-1, 6)
     left = change.ravel() - G @ np.linalg.lstsq(G, change.ravel())[0]
     return np.asarray(left.reshape(change.shape))
 

@@ -7,7 +7,7 @@ of interest at position c is Phi_c times the unknowns, with covariance Phi_c M^-
   equations, after elimination of its own position: B_i = (1 - hat) W^1/2 Q_i, of rank one with four stations. The
   quantity is the position of a further target at c: K_c from its own readings, Phi_c the effect of the stations.
 * ``axes``: the unknowns are also the errors of the axes, series of polynomials with coefficients of an expected size
-  (see `parameters`): B_i = W^1/2 [e A_i, Q_i]. The quantity is the volumetric error at c.
+  (see `errormotion.kinematics.volumes`): B_i = W^1/2 [e A_i, Q_i]. The quantity is the volumetric error at c.
 
 Both are in the datum of the whole grid, without rigid motions. Targets are added one by one, each with the largest
 gain; then exchanged one by one while that is a gain, estimated by an update of rank n and calculated exactly for the
@@ -22,8 +22,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.identification.parameters import Chain, Term, first_order, unknowns
-from errormotion.methods.multilateration.network.model import Stations, directions, motions
+from errormotion.kinematics.twists import rigid_motions
+from errormotion.kinematics.volumes import Term, first_order, is_rotation
+from errormotion.methods.multilateration.identification.parameters import volume_of
+from errormotion.methods.multilateration.network.model import Stations, directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,8 +70,8 @@ class Expected:
             Not a chain of X, Y and Z.
         """
         at = np.tile(reflector, (len(position), 1))
-        model = Chain.of(chain, position, at)
-        terms = unknowns(model, order)
+        model = volume_of(chain, position, at)
+        terms = model.terms(order)
         size = np.array([_size(term, displacement, rotation) for term in terms])
         return cls(model.columns(terms, position, at), size)
 
@@ -79,7 +81,7 @@ def _size(term: Term, displacement: float, rotation: float) -> float:
     if term.order < 0:
         return rotation
     higher = term.order - first_order(term.error) + 1
-    return float((rotation if term.error[1] in "ABC" else displacement) / higher**_EXPONENT)
+    return float((rotation if is_rotation(term.error) else displacement) / higher**_EXPONENT)
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Volume:
         Q *= w[..., None]
         E = w[..., None] * e
         centre = point[:count].mean(axis=0)
-        G = motions(point[:count], centre)
+        G = rigid_motions(point[:count], centre)
         if expected is None:
             A = np.einsum("kja,kjb->kab", E, E)
             A[~fine] = np.eye(3)
