@@ -39,7 +39,7 @@ def table(errors: xr.Dataset, when: str, along: str = "") -> Table:
     ``along`` is the name of a place, such as ``instant``, from one to another of which the noise is independent.
     """
     groups = groups_at(errors)
-    names = errors.em.names
+    names, own = errors.em.names, errors.em.iso_names()
     units = [UM if i < 3 else SECOND_OF_ARC for i in range(len(names))]
     sizes = np.array([size for _, size in units])
     combined = sigma(errors)
@@ -55,7 +55,7 @@ def table(errors: xr.Dataset, when: str, along: str = "") -> Table:
     return Table(
         f"Uncertainty budget {when}: standard uncertainty (k = 1) of the "
         f"{'six error motions at the functional point' if len(names) > 1 else names[0]}, by group of sources.",
-        ["source", *(f"{name} / {unit}" for name, (unit, _) in zip(names, units, strict=True))],
+        ["source", *(f"{own[name]} / {unit}" for name, (unit, _) in zip(names, units, strict=True))],
         [
             *(row(readable(name, along), values) for name, values in groups.items()),
             row("combined, k = 1", combined),

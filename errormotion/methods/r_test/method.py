@@ -64,6 +64,8 @@ class RTest(ModelMethod):
     Settings: ClassVar[type[PluginSettings]] = TestSettings
     raw_schemas = lazy("errormotion.methods.r_test.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.r_test.conformance:subjects")
+    chapters = lazy("errormotion.methods.r_test.report:chapters")
+    texts = lazy("errormotion.methods.r_test.report:texts")
     grows = "angle"
 
     def observe(self, raw: xr.Dataset, settings: Any = None) -> Observed:  # noqa: ARG002 - the data state everything

@@ -82,7 +82,7 @@ class Curves:
         known = _known(flat, along, others)
         picks = panels.evenly(np.flatnonzero(known).tolist(), self.most)
         scale, order = panels.sorted_along(ds, along)
-        colours = panels.colours(ds, others, len(picks))
+        looks = panels.looks(ds, others, len(picks))
         smooth = _smoothed(ds, self.smooth, others)
         own = _exact(ds, self.at, along, others, order, scale)
 
@@ -96,16 +96,16 @@ class Curves:
             for number, each in enumerate(panel):
                 values, expanded = (_curves(part, each.size, along, others, order) for part in (each.values, each.u))
                 assert values is not None
-                for colour, pick in zip(colours, picks, strict=True):
-                    shade = canvas.COLOURS[number % len(canvas.COLOURS)] if len(panel) > 1 else colour
+                for own_look, pick in zip(looks, picks, strict=True):
+                    colour, dash = panels.look(number) if len(panel) > 1 else own_look
                     band = 2 * expanded[pick] if expanded is not None and self.band else None
                     name = panels.name_of(ds, others, pick) or each.name
                     if smooth is not None and (curve := smooth(each, pick)) is not None:
-                        canvas.curve(axes, *curve, colour=shade, name=name)
+                        canvas.curve(axes, *curve, colour=colour, dash=dash, name=name)
                     elif scale.joined and scale.values.size > 1:
-                        canvas.curve(axes, scale.values, values[pick], band, colour=shade, name=name)
+                        canvas.curve(axes, scale.values, values[pick], band, colour=colour, dash=dash, name=name)
                         continue
-                    panels.points(axes, scale.values if own is None else own[pick], values[pick], band, shade)
+                    panels.points(axes, scale.values if own is None else own[pick], values[pick], band, colour)
             _ticks(axes, scale)
             limits = [
                 (each.name, source.limits[each.of][0] / each.size, source.limits[each.of][1] / each.size)
@@ -115,12 +115,12 @@ class Curves:
             if limits:
                 canvas.limit_lines(axes, limits)
 
-        legend: list[tuple[str, str]] = []
+        legend: list[tuple[str, panels.Look]] = []
         if others and len(picks) > 1:
-            legend = [(panels.name_of(ds, others, pick), colour) for pick, colour in zip(picks, colours, strict=True)]
+            legend = [(panels.name_of(ds, others, pick), each) for pick, each in zip(picks, looks, strict=True)]
         elif any(len(panel) > 1 for panel in found):
             widest = max(found, key=len)
-            legend = [(each.name, canvas.COLOURS[k % len(canvas.COLOURS)]) for k, each in enumerate(widest)]
+            legend = [(each.name, panels.look(k)) for k, each in enumerate(widest)]
         columns = self.columns or (1 if len(found) == 1 else 2)
         svg = panels.grid(
             [partial(paint, panel=panel) for panel in found], key, columns=columns,

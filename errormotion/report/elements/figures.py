@@ -15,6 +15,7 @@ from errormotion.report import document
 from errormotion.report.budget import readable
 from errormotion.report.document import Block, Cell, KeyFigure, Source, estimate, or_dash
 from errormotion.report.elements.quantities import unit_of
+from errormotion.report.elements.tables import filled
 from errormotion.report.text import decimals_of, fixed, listed, rounded, significant
 from errormotion.tolerances.conformity import matches
 
@@ -82,7 +83,7 @@ class FigureTable:
     units : mapping of str to str
         As in `KeyFigures`.
     meanings : mapping of str to str
-        What a figure is, by its name with ``*``; a further column if there are any.
+        What a figure is, by its name with ``*``; stated after the name.
     """
 
     caption: str = "Figures of merit. After ±: expanded uncertainty, k = 2."
@@ -100,13 +101,12 @@ class FigureTable:
         rows: list[list[Cell | str]] = []
         for each, limit in zip(figures, limits, strict=True):
             unit, size = unit_of(each.unit, (self.units or {}).get(each.unit, ""))
-            row: list[Cell | str] = [each.name]
-            if self.meanings:
-                row.append(next((text for name, text in self.meanings.items() if matches(name, each.name)), ""))
-            row += [estimate(each.value / size, each.expanded_uncertainty / size, signed=False), unit]
+            meaning = next((text for name, text in (self.meanings or {}).items() if matches(name, each.name)), "")
+            cell = estimate(each.value / size, each.expanded_uncertainty / size, signed=False)
+            row: list[Cell | str] = [f"{each.name}, {meaning}" if meaning else each.name, cell, unit]
             rows.append([*row, significant(limit / size, 3) if math.isfinite(limit) else ""] if some else row)
-        head = ["figure", *(["quantity"] if self.meanings else []), "value", "unit", *(["limit"] if some else [])]
-        return [document.Table(self.caption, head, rows)]
+        head = ["figure", "value", "unit", *(["limit"] if some else [])]
+        return [document.Table(filled(self.caption, source.errors), head, rows)]
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class FigureBudget:
         rows = [row(readable(name), [math.sqrt(max(each.get(name, 0.0), 0.0)) for each in found]) for name in groups]
         rows += [row("combined, k = 1", total), row("expanded, k = 2", [2 * u for u in total])]
         names = [escape(f"{each.name} / {unit}") for each, (unit, _) in zip(figures, sizes, strict=True)]
-        return [document.Table(self.caption, ["source", *names], rows)]
+        return [document.Table(filled(self.caption, source.errors), ["source", *names], rows)]
 
 
 def chosen(source: Source, names: Sequence[str]) -> list[FigureOfMerit]:

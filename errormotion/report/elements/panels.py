@@ -52,12 +52,22 @@ def evenly(indices: Sequence[int], most: int) -> list[int]:
     return [int(indices[k]) for k in np.unique(np.linspace(0, len(indices) - 1, most).round().astype(int))]
 
 
-def colours(ds: xr.Dataset, others: Sequence[str], count: int) -> list[str]:
-    """Return a colour for each curve: from light to dark along a scale, legible in grey; else different ones."""
+Look = tuple[str, tuple[float, ...] | None]
+"""Colour and dashes of a curve."""
+
+
+def looks(ds: xr.Dataset, others: Sequence[str], count: int) -> list[Look]:
+    """Return the look of each curve: from light to dark along a scale, legible in grey; else different ones."""
     if len(others) == 1 and scale_of(ds, others[0]).joined and count > 1:
         ramp = matplotlib.colormaps["viridis_r"]
-        return [matplotlib.colors.to_hex(ramp(place)) for place in np.linspace(0.22, 1.0, count)]
-    return [canvas.COLOURS[k % len(canvas.COLOURS)] for k in range(count)]
+        return [(matplotlib.colors.to_hex(ramp(place)), None) for place in np.linspace(0.22, 1.0, count)]
+    return [look(k) for k in range(count)]
+
+
+def look(number: int) -> Look:
+    """Return the look of a curve by its number."""
+    dash, colour = divmod(number, len(canvas.COLOURS))
+    return canvas.COLOURS[colour], canvas.DASHES[dash % len(canvas.DASHES)]
 
 
 def name_of(ds: xr.Dataset, others: Sequence[str], index: int) -> str:
@@ -88,7 +98,7 @@ def grid(
     down: bool = False,
     right: float = 0.0,
     label: str = "",
-    legend: Sequence[tuple[str, str]] = (),
+    legend: Sequence[tuple[str, Look]] = (),
     frames: bool = True,
 ) -> Markup:
     """Return the drawing of panels in a grid.
@@ -108,7 +118,7 @@ def grid(
         Room on the right of each panel, inch.
     label : str
         Of the abscissa, below the lowest panels.
-    legend : sequence of (name, colour)
+    legend : sequence of (name, look)
     frames : bool
         Whether the panels have axes of their own.
     """
@@ -133,7 +143,10 @@ def grid(
             elif label:
                 axes.tick_params(labelbottom=False)
         if legend:
-            handles = [Line2D([], [], color=colour, linewidth=1.4) for _, colour in legend]
+            handles = [
+                Line2D([], [], color=colour, linewidth=1.4, linestyle=(0, dash) if dash else "-")
+                for _, (colour, dash) in legend
+            ]
             figure.legend(
                 handles, [name for name, _ in legend], loc="lower center", ncols=min(each, len(legend)),
                 handlelength=1.2, handletextpad=0.4, columnspacing=1.0, borderaxespad=0.1,
