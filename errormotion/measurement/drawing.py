@@ -17,10 +17,11 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import provenance
+from errormotion.estimation.checks.correlated import coloured
 from errormotion.estimation.derivatives import along, column
 from errormotion.estimation.problem import Problem
 from errormotion.measurement.identification import Solved, dataset, solve
-from errormotion.measurement.observed import Model
+from errormotion.measurement.observed import Model, Observed, as_expected
 from errormotion.plugins import MethodInfo, Redraw, Redrawing
 
 __all__ = ["READINGS", "redrawing", "simulate"]
@@ -40,7 +41,9 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
 
     def noisy(data: xr.Dataset, its: Any, generator: np.random.Generator) -> tuple[xr.Dataset, Any]:
         size = 1.0 if np.isinf(freedom) else float(np.sqrt(freedom / generator.chisquare(freedom)))
-        shift = (root @ generator.standard_normal((*readings.shape, 1)))[..., 0] * size
+        shift = _noisy(observed, root, generator.standard_normal(readings.shape)) * size
+        if solved.rounding is not None:
+            shift = shift + solved.rounding.sd * generator.standard_normal(readings.shape)
         return data.assign({READINGS: data[READINGS] + shift}), its
 
     groups = {source.group for source in solved.relative.errors.sources}
@@ -74,7 +77,7 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     if observed.recorded is None:
         raise ValueError("simulate: expected a model that states 'recorded', the variable of its readings")
     problem = observed.problem
-    exact = solve(replace(observed, noise_increases=False, robust=False))
+    exact = solve(as_expected(observed))
     drawn = {name: generator.standard_normal(number) for name, number in _drawn(problem).items()}
     true = _moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)
@@ -172,6 +175,14 @@ def _consistent(true: Problem, exact: Solved, drawn: dict[str, Array]) -> Array:
         L = along(lambda moved: true.evaluate(moved.reshape(shape), rows), y, scale)
         y = y - (np.linalg.pinv(L) @ r[..., None])[..., 0]
     return y.reshape(shape)
+
+
+def _noisy(observed: Observed, root: Array, z: Array) -> Array:
+    """Return noise (n, r) from independent standard normal numbers, correlated along the order of the readings."""
+    if observed.order is not None and observed.correlation:
+        used = np.all(np.isfinite(column(observed.problem.readings)), axis=1)
+        z = coloured(z, used, observed.order, observed.correlation, observed.series)
+    return np.asarray((root @ z[..., None])[..., 0])
 
 
 def _noise(solved: Solved) -> tuple[Array, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -18,21 +18,27 @@ from errormotion.estimation.checks.candidates import Candidate
 from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.reliability import reliability
-from errormotion.estimation.components import noise_variance
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Errors, errors_of
-from errormotion.estimation.variance import expansion, variance_factor
+from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF
+from errormotion.measurement.noise import (
+    estimated_noise,
+    fitted,
+    has_priors,
+    neighbours_of,
+    rounding_of,
+    scaled,
+    scatter_of,
+    searchable,
+    sentence_on,
+    steps_of,
+)
 from errormotion.measurement.observed import Model, Observed, Solved
 from errormotion.plugins import MethodInfo
 
-__all__ = ["Solved", "dataset", "estimated_noise", "identify", "solve"]
-
-_STEPS = 10
-_SAME = 1e-6
-"""Relative change of the variance of the noise that ends its estimation."""
+__all__ = ["Solved", "dataset", "identify", "solve"]
 
 
 def solve(observed: Observed) -> Solved:
@@ -45,34 +51,40 @@ def solve(observed: Observed) -> Solved:
     """
     try:
         given = observed.problem
+        observed = replace(observed, resolution=steps_of(observed))
         observed, found, search = _cleaned(observed)
-        problem = observed.problem
-        priors = _has_priors(problem)
-        estimated: list[Fit] = []
-
-        def estimate() -> tuple[float, float]:
-            at, factor, freedom = estimated_noise(found, refresh=observed.refresh, what=observed.what)
-            estimated.append(at)
-            return factor, freedom
-
-        scatter = variance_factor(
-            found.chi2,
-            found.freedom,
-            stated=problem.noise.stated,
-            increase=observed.noise_increases,
-            priors=priors,
-            estimate=estimate if priors else None,
-            what=observed.what,
-            cause=observed.noise_cause,
-            size=observed.noise_size,
+        neighbours = neighbours_of(observed, found)
+        observed = replace(
+            observed,
+            correlation=neighbours.phi,
+            notes=[*observed.notes, neighbours.note],
+            doubts=[*observed.doubts, neighbours.doubt],
         )
-        if estimated and scatter.factor == 1.0 and problem.noise.stated:
-            estimated.clear()  # not larger than stated
+        if neighbours.phi > 0:
+            found = fitted(observed, observed.problem, found)
+        scatter, final = scatter_of(observed, found)
         # An estimated variance has a Student distribution (GUM, G.3.2).
-        factor = (1.0 if estimated else scatter.factor) * float(expansion(scatter.freedom)) ** 2
-        final = estimated[0] if estimated else found
+        factor = (scatter.factor if final is found else 1.0) * float(
+            expansion(neighbours.freedom(scatter.freedom))
+        ) ** 2
+        base = observed.problem if final is found else scaled(observed.problem, scatter.factor)
+        rounding = rounding_of(observed, base, scatter.factor if final is found else 1.0)
+        if rounding is not None:
+            observed = replace(observed, notes=[*observed.notes, sentence_on(observed, rounding)])
+            base, factor = scaled(base, factor, rounding.sd), 1.0
+            final = fitted(observed, base, final)
+        white = final if neighbours.phi == 0 else fit(base, refresh=observed.refresh, what=observed.what)
         errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
-        solved = Solved(observed, final, scatter, related(observed, errors), given, search)
+        solved = Solved(
+            observed=observed,
+            fit=final,
+            white=white,
+            scatter=scatter,
+            relative=related(observed, errors),
+            given=given,
+            cleaned=search,
+            rounding=rounding,
+        )
         return solved if observed.finish is None else observed.finish(solved)
     except FitError as error:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
@@ -83,14 +95,15 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
     if not observed.robust:
         return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what), None
     problem, what = observed.problem, observed.what
-    if not problem.noise.stated and _has_priors(problem):
+    if not problem.noise.stated and has_priors(problem):
         # Else a unit of noise would hide what the readings say about the constants.
         problem = estimated_noise(
             fit(problem, refresh=observed.refresh, what=what), refresh=observed.refresh, what=what
         )[0].problem
+    searched = searchable(observed, problem)
     try:
         found = cleaned(
-            problem,
+            searched,
             suspects=observed.suspects,
             whole=observed.whole,
             name=observed.name,
@@ -100,7 +113,7 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
         )
     except FitError as error:
         # Too many readings would have to be excluded, if all of them determine the unknowns.
-        first = fit(problem, refresh=observed.refresh, what=what)
+        first = fit(searched, refresh=observed.refresh, what=what)
         suspects = () if observed.suspects is None else observed.suspects(first)
         raise _contradiction(what, [_likeliest(first, suspects)]) from error
     words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
@@ -108,14 +121,17 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
         raise _contradiction(what, words)
     name = what.removeprefix("the ")
     notes, doubts = exclusions.notes(found, name), exclusions.doubts(found, name)
+    last = found.fit
+    if searched is not problem:
+        last = fitted(observed, replace(last.problem, noise=problem.noise), last)
     after = replace(
         observed,
-        problem=found.fit.problem,
+        problem=last.problem,
         robust=False,
         notes=[*observed.notes, *notes],
         doubts=[*observed.doubts, *doubts],
     )
-    return after, found.fit, found
+    return after, last, found
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:
@@ -136,39 +152,6 @@ def _likeliest(found: Fit, suspects: Iterable[Candidate]) -> str:
         if gain > best:
             best, words = gain, each.words
     return words
-
-
-def _has_priors(problem: Problem) -> bool:
-    """Return whether the sum of squares contains priors."""
-    return bool(problem.adjusted) or any((block.information[block.freed] > 0).any() for block in problem.unknowns)
-
-
-def estimated_noise(
-    found: Fit, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
-) -> tuple[Fit, float, float]:
-    """Return the fit with the noise of its readings by restricted likelihood, its variance factor and freedom.
-
-    Priors keep their standard deviations. The fit is repeated with the noise found, since the estimate is that of the
-    problem as linearised at the fit.
-
-    Raises
-    ------
-    FitError
-        The readings have no redundancy.
-    """
-    problem, noise, size = found.problem, found.problem.noise, 1.0
-    for _ in range(_STEPS):
-        factor, freedom = noise_variance(found)
-        if not factor > 0:
-            break
-        size *= float(np.sqrt(factor))
-        sd = None if noise.sd is None else np.asarray(noise.sd * size)
-        root = None if noise.root is None else np.asarray(noise.root * size)
-        scaled = replace(problem, noise=replace(noise, sd=sd, root=root))
-        found = fit(scaled, refresh=refresh, what=what, start=found.linear.at)
-        if abs(factor - 1) < _SAME:
-            break
-    return found, size**2, freedom
 
 
 def related(observed: Observed, errors: Errors) -> Relative:
@@ -246,14 +229,14 @@ def dataset(
 def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     """Return residuals, exclusions and reliability of the readings, over their dims in the raw data."""
     recorded, given = solved.observed.recorded, solved.given
-    if recorded is None or solved.fit.residual.size != given.readings.size:
+    if recorded is None or solved.white.residual.size != given.readings.size:
         return {}
     name, dims = recorded
     shape = tuple(raw.sizes[dim] for dim in dims)
     unit = str(raw[name].attrs.get("units", "1"))
-    found = reliability(solved.fit, factor=solved.fit_factor)
-    out = np.isfinite(given.readings) & ~np.isfinite(solved.fit.problem.readings)
-    residual = replace(solved.fit.problem, readings=given.readings).residuals(solved.fit.linear.at)
+    found = reliability(solved.white, factor=solved.fit_factor)
+    out = np.isfinite(given.readings) & ~np.isfinite(solved.white.problem.readings)
+    residual = replace(solved.white.problem, readings=given.readings).residuals(solved.white.linear.at)
     parts: dict[str, tuple[Array, dict[str, str]]] = {
         "residual": (residual, {"units": unit, "long_name": "reading minus fitted, also of excluded readings"}),
         "redundancy": (found.redundancy, {"units": "1", "long_name": "share of an error that the residual shows"}),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from errormotion.kinematics.iso import DOF
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from errormotion.estimation.blocks import Index
     from errormotion.estimation.checks.candidates import Candidate
     from errormotion.estimation.checks.exclusions import Cleaned
+    from errormotion.estimation.checks.resolution import Rounding
     from errormotion.estimation.datum import Datum, Relative
     from errormotion.estimation.fit import Fit
     from errormotion.estimation.problem import Problem
     from errormotion.estimation.sources import Places
     from errormotion.estimation.variance import Scatter
 
-__all__ = ["Model", "Observed", "Solved"]
+__all__ = ["Model", "Observed", "Solved", "as_expected"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,6 +63,18 @@ class Observed:
         From a factor for the standard deviation of the noise to the noise in words: "1.3 um".
     noise_increases : bool
         Whether the uncertainties follow the residuals if these scatter more than stated.
+    unit : str
+        Of the readings, for notes: m or rad.
+    resolution : float or ndarray, (r,), optional
+        Step of the scale that the readings, or each of their numbers, are rounded to, in their unit; 0 for none. By
+        default it is found from the readings.
+    order : ndarray, (n,), optional
+        Time or position of each reading. With it, noise that is correlated along this order is found and taken into
+        account (`errormotion.estimation.checks.correlated`).
+    series : ndarray of int, (n,), optional
+        The run or the channel of each reading; different ones are independent.
+    correlation : float, optional
+        Of neighbours, if it is known; otherwise it is estimated.
     refresh : callable, optional
         See `errormotion.estimation.fit.fit`.
     robust : bool
@@ -108,6 +121,11 @@ class Observed:
     noise_cause: str = ""
     noise_size: Callable[[float], str] | None = None
     noise_increases: bool = True
+    unit: str = "m"
+    resolution: float | Array | None = None
+    order: Array | None = None
+    series: Index | None = None
+    correlation: float | None = None
     refresh: Callable[[Problem, Any], Problem] | None = None
     robust: bool = True
     suspects: Callable[[Fit], Iterable[Candidate]] | None = None
@@ -131,6 +149,11 @@ class Solved:
     observed : Observed
         Without outliers, which are not looked for any more.
     fit : Fit
+        From which the errors follow.
+    white : Fit
+        With independent noise of the stated size, for residuals and reliability.
+    rounding : Rounding, optional
+        What rounding adds to the noise.
     scatter : Scatter
         What the residuals say about the noise.
     relative : Relative
@@ -143,15 +166,23 @@ class Solved:
 
     observed: Observed
     fit: Fit
+    white: Fit
     scatter: Scatter
     relative: Relative
     given: Problem
     cleaned: Cleaned | None = None
+    rounding: Rounding | None = None
 
     @property
     def fit_factor(self) -> float:
-        """Variance factor that the noise in ``fit`` lacks: 1 if it was estimated beside priors, as part of the fit."""
-        return self.scatter.factor if self.fit.problem.noise is self.observed.problem.noise else 1.0
+        """Variance factor that the noise in ``white`` lacks: 1 if it is a part of the fit, as beside priors."""
+        return self.scatter.factor if self.white.problem.noise is self.observed.problem.noise else 1.0
+
+
+def as_expected(observed: Observed) -> Observed:
+    """Return a model of expected readings, which say nothing about their noise."""
+    step = 0.0 if observed.resolution is None else observed.resolution
+    return replace(observed, noise_increases=False, robust=False, resolution=step, correlation=0.0)
 
 
 class Model(Protocol):

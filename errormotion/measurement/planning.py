@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import xarray as xr
 
 from errormotion.datasets import provenance
 from errormotion.measurement.identification import dataset, solve
-from errormotion.measurement.observed import Model
+from errormotion.measurement.observed import Model, as_expected
 from errormotion.plugins import MethodInfo
 
 __all__ = ["plan"]
@@ -24,6 +23,6 @@ def plan(model: Model, settings: Any, info: MethodInfo) -> xr.Dataset:
         A test with these settings does not determine the result.
     """
     raw = model.expected(settings)
-    observed = replace(model.observe(raw, settings), noise_increases=False, robust=False)
+    observed = as_expected(model.observe(raw, settings))
     origin = provenance.make(settings, None, None, steps=["plan"])
     return dataset(model, solve(observed), raw, info, origin, planned=True)

@@ -16,7 +16,8 @@ from errormotion.estimation.fit import fit
 from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places
 from errormotion.measurement import Observed
-from errormotion.measurement.identification import estimated_noise, solve
+from errormotion.measurement.identification import solve
+from errormotion.measurement.noise import estimated_noise
 
 T = TypeVar("T")
 N = 40

@@ -28,7 +28,7 @@ from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown, linearised
 
-__all__ = ["Correlated", "autoregressive", "correlated", "effective_number", "lag_one", "with_trend"]
+__all__ = ["Correlated", "autoregressive", "coloured", "correlated", "effective_number", "lag_one", "with_trend"]
 
 TYPICAL = 0.8
 """Standard deviation of artanh(phi) in its prior: two thirds of all phi below 0.66.
@@ -54,12 +54,15 @@ class Correlated:
         Correlation of neighbours, and its standard uncertainty.
     independent : float
         Number of independent readings with as much information on a mean as all of these.
+    gain : float
+        Decrease of -2 log L against white noise.
     """
 
     fit: Fit
     phi: float
     u_phi: float
     independent: float
+    gain: float
     _near: tuple[Fit, Fit, float]
 
     def freedom_of(self, a: Array, b: Array) -> Array:
@@ -120,6 +123,7 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
         phi=phi,
         u_phi=u_phi,
         independent=_independent(problem, order, series, phi),
+        gain=max(_deviance(problem, at, order, series, 0.0) - _deviance(problem, at, order, series, phi), 0.0),
         _near=(fits[1], fits[2], 2 * _STEP),
     )
 
@@ -198,6 +202,21 @@ def autoregressive(problem: Problem, order: Array, phi: float, series: Index | N
         reading_scale=np.tile(np.broadcast_to(np.asarray(problem.reading_scale, dtype=float), (r,)), 2),
         derivatives=None if problem.derivatives is None else derivatives,
     )
+
+
+def coloured(z: Array, used: NDArray[np.bool_], order: Array, phi: float, series: Index | None = None) -> Array:
+    """Return numbers that are correlated along an order from independent ones, (n, r).
+
+    ``e_t = phi e_(t-1) + sqrt(1 - phi^2) z_t``; see `correlated`.
+    """
+    chain = _Chain.between(used, order, series)
+    power = np.where(chain.first, 0.0, phi**chain.distance)[:, None]
+    step = np.sqrt(1 - np.square(power)) * z
+    found = step.copy()
+    at = np.flatnonzero(chain.first)
+    while (at := chain.after[at][chain.after[at] >= 0]).size:  # one reading of each series at a time
+        found[at] = power[at] * found[chain.before[at]] + step[at]
+    return np.asarray(found)
 
 
 def with_trend(
@@ -305,8 +324,13 @@ class _Chain:
 
     @classmethod
     def of(cls, problem: Problem, order: Array, series: Index | None) -> _Chain:
-        n = len(problem.readings)
-        used: NDArray[np.bool_] = np.all(np.isfinite(column(problem.readings)), axis=1)
+        """Return the neighbours among the readings of a problem that are all known."""
+        return cls.between(np.all(np.isfinite(column(problem.readings)), axis=1), order, series)
+
+    @classmethod
+    def between(cls, used: NDArray[np.bool_], order: Array, series: Index | None) -> _Chain:
+        """Return the neighbours among the readings that are used, (n,)."""
+        n = len(used)
         which = np.zeros(n, dtype=np.intp) if series is None else np.asarray(series)
         ranked = np.lexsort((order, which))
         ranked = ranked[used[ranked]]

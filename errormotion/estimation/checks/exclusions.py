@@ -415,6 +415,8 @@ class _Sequence:
         several = int(min(_TOGETHER, max(_SIZE / (unknowns * self.k), 1)))
         order = np.argsort(gain, axis=None)[::-1][:several]
         self.where = [(int(o) // gain.shape[1], int(o) % gain.shape[1]) for o in order if gain.flat[o] > 0]
+        if not self.where:
+            return
         self.u, self.N = reduced(fit, *numbers.columns(self.where))
         self.floor = MIN_REDUNDANCY * np.array([numbers.weight(at) for at in self.where])
         self.order = self._followed(min(len(self.where), max(fit.freedom // (4 * self.k), 1)))

@@ -1,0 +1,236 @@
+"""The noise of the readings of a model: its size, the correlation of neighbours, and rounding.
+
+Each of them makes an uncertainty larger, with a sentence, or the uncertainty is refused as unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from errormotion.arrays import Array
+from errormotion.errors import FitError
+from errormotion.estimation.blocks import Noise
+from errormotion.estimation.checks import resolution
+from errormotion.estimation.checks.correlated import autoregressive, correlated
+from errormotion.estimation.checks.resolution import Rounding
+from errormotion.estimation.components import noise_variance
+from errormotion.estimation.derivatives import column
+from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.robust import scale_about_zero
+from errormotion.estimation.variance import Scatter, variance_factor
+from errormotion.measurement.observed import Observed
+
+__all__ = [
+    "Neighbours",
+    "estimated_noise",
+    "fitted",
+    "has_priors",
+    "neighbours_of",
+    "rounding_of",
+    "scaled",
+    "scatter_of",
+    "searchable",
+    "sentence_on",
+    "steps_of",
+]
+
+_STEPS = 10
+_FALSE_NOTE = 0.01
+"""Probability of a note on a correlation of white noise."""
+_FEW = 8.0
+"""Independent readings below which the size of a correlated noise is hardly known."""
+_COARSE = 0.5
+"""Noise in steps of the scale from which rounding is a part of the scatter."""
+_DIGITS = 1e-12
+"""Scatter that is due to the digits of floating-point numbers, relative to the largest reading."""
+_SAME = 1e-6
+"""Relative change of the variance of the noise that ends its estimation."""
+
+
+def scatter_of(observed: Observed, found: Fit) -> tuple[Scatter, Fit]:
+    """Return what the residuals say about the noise, and the fit with it: another one if it was estimated."""
+    priors, stated = has_priors(observed.problem), observed.problem.noise.stated
+    estimated: list[Fit] = []
+
+    def estimate() -> tuple[float, float]:
+        at, factor, freedom = estimated_noise(found, refresh=observed.refresh, what=observed.what)
+        estimated.append(at)
+        return factor, freedom
+
+    scatter = variance_factor(
+        found.chi2,
+        found.freedom,
+        stated=stated,
+        increase=observed.noise_increases,
+        priors=priors,
+        estimate=estimate if priors else None,
+        what=observed.what,
+        cause=observed.noise_cause,
+        size=observed.noise_size,
+    )
+    larger = not stated or scatter.factor > 1.0
+    return scatter, estimated[0] if estimated and larger else found
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Correlation of the noise of neighbouring readings, its standard uncertainty, and a sentence."""
+
+    phi: float = 0.0
+    u: float = 0.0
+    note: str = ""
+    doubt: str = ""
+
+    def freedom(self, freedom: float) -> float:
+        """Return the degrees of freedom of the variance of a mean, which is proportional to (1 + phi) / (1 - phi).
+
+        ``2 / f' = 2 / f + (d log g / d phi)^2 u(phi)^2`` with ``d log g / d phi = 2 / (1 - phi^2)`` (Satterthwaite).
+        """
+        return 2.0 / (2.0 / freedom + (2.0 * self.u / (1.0 - self.phi**2)) ** 2) if self.u > 0 else freedom
+
+
+def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
+    """Return the correlation of the noise along the order of the readings, if there is one."""
+    if observed.order is None or found.freedom < 2:
+        return Neighbours()
+    if observed.correlation is not None:
+        return Neighbours(observed.correlation)
+    along = correlated(found, observed.order, observed.series)
+    if not along.phi > 0:
+        return Neighbours()
+    note = doubt = ""
+    if along.gain > float(chdtri(1, 2 * _FALSE_NOTE)):
+        what = f"The noise of neighbouring {observed.what.removeprefix('the ')} is correlated ({along.phi:.2f})"
+        if along.independent < _FEW and not observed.problem.noise.stated:
+            doubt = (
+                f"{what}: they are worth {along.independent:.2g} independent ones, so that their noise is hardly known and "
+                "the uncertainties may be too small. State the noise, or measure more of them."
+            )
+        else:
+            note = f"{what}; the uncertainties contain it."
+    return Neighbours(along.phi, along.u_phi, note, doubt)
+
+
+def fitted(observed: Observed, problem: Problem, before: Fit) -> Fit:
+    """Return the fit of a problem with the correlation of its noise, from the solution of a similar one."""
+    start = before.linear.at
+    if observed.order is not None and observed.correlation:
+        problem = autoregressive(problem, observed.order, observed.correlation, observed.series)
+    return fit(problem, refresh=observed.refresh, what=observed.what, start=start)
+
+
+def steps_of(observed: Observed) -> Array:
+    """Return the step of the scale of each number of a reading, (r,), stated or as the readings show it; 0 = none."""
+    y = column(observed.problem.readings)
+    steps = np.array([resolution.step_of(one) for one in y.T]) if observed.resolution is None else observed.resolution
+    return np.broadcast_to(np.asarray(steps, dtype=float), (y.shape[1],))
+
+
+def searchable(observed: Observed, problem: Problem) -> Problem:
+    """Return the problem with a noise that contains rounding, for the search of outliers.
+
+    Repeats that are rounded alike have no scatter, against which the next mark of the scale would be an outlier.
+    """
+    steps = np.asarray(observed.resolution)
+    if not steps.any():
+        return problem
+    shape = column(problem.readings).shape
+    if problem.noise.stated:
+        added = np.broadcast_to(steps / np.sqrt(12), shape)
+        variance = np.diagonal(problem.noise.covariance(shape), axis1=1, axis2=2)
+        return scaled(problem, 1.0, np.where(variance < np.square(_COARSE * steps), added, 0.0))
+    residual = column(fit(problem, refresh=observed.refresh, what=observed.what).residual)
+    if residual.shape != shape:
+        return problem
+    scales = np.array([scale_about_zero(one) for one in residual.T])
+    if not (scales < _COARSE * steps).all():
+        return problem
+    sd = np.broadcast_to(np.hypot(scales, steps / np.sqrt(12)), shape)
+    return replace(problem, noise=Noise(sd=sd, stated=True))
+
+
+def rounding_of(observed: Observed, problem: Problem, factor: float) -> Rounding | None:
+    """Return what rounding adds to a noise.
+
+    Raises
+    ------
+    FitError
+        Neither a noise nor a step of the scale is known: the uncertainty would be 0.
+    """
+    shape = column(problem.readings).shape
+    variance = np.diagonal(problem.noise.covariance(shape), axis1=1, axis2=2) * factor
+    found = resolution.rounding(problem, np.sqrt(variance), observed.resolution)
+    smallest = float(np.nanmax(np.abs(column(problem.readings)), initial=0.0)) * _DIGITS
+    if found is None and not problem.noise.stated and float(variance.max(initial=0.0)) <= smallest**2:
+        raise FitError(
+            f"{observed.what} do not scatter at all, and do not show the step of their scale: their uncertainty "
+            "is unknown. State their noise, or the resolution of the instrument"
+        )
+    return found
+
+
+def sentence_on(observed: Observed, rounding: Rounding) -> str:
+    """Return the sentence on rounded readings."""
+    size = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(observed.unit, (1.0, observed.unit))
+
+    def words(value: float) -> str:
+        return f"{value * size[0]:.3g} {size[1]}"
+
+    return (
+        f"{observed.what[:1].upper()}{observed.what[1:]} are multiples of {words(rounding.step)}, with a noise of "
+        f"{words(rounding.noise)} before rounding: rounding is a part of the uncertainties."
+    )
+
+
+def scaled(problem: Problem, factor: float, added: Array | None = None) -> Problem:
+    """Return a problem with the variance of its noise times a factor, and with further standard deviations (n, r)."""
+    shape = column(problem.readings).shape
+    if added is None or problem.noise.root is None:
+        sd = problem.noise.sd
+        if sd is None:
+            root = np.asarray(problem.noise.root) * np.sqrt(factor)
+            return replace(problem, noise=replace(problem.noise, root=root))
+        whole = np.broadcast_to(sd[:, None] if np.ndim(sd) == 1 else sd, shape) * np.sqrt(factor)
+        whole = whole if added is None else np.hypot(whole, added)
+        return replace(problem, noise=replace(problem.noise, sd=whole))
+    V = problem.noise.covariance(shape) * factor + np.square(added)[:, :, None] * np.eye(shape[1])
+    return replace(problem, noise=replace(problem.noise, root=np.asarray(np.linalg.cholesky(V))))
+
+
+def has_priors(problem: Problem) -> bool:
+    """Return whether the sum of squares contains priors."""
+    return bool(problem.adjusted) or any((block.information[block.freed] > 0).any() for block in problem.unknowns)
+
+
+def estimated_noise(
+    found: Fit, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
+) -> tuple[Fit, float, float]:
+    """Return the fit with the noise of its readings by restricted likelihood, its variance factor and freedom.
+
+    Priors keep their standard deviations. The fit is repeated with the noise found, since the estimate is that of the
+    problem as linearised at the fit.
+
+    Raises
+    ------
+    FitError
+        The readings have no redundancy.
+    """
+    problem, noise, size = found.problem, found.problem.noise, 1.0
+    for _ in range(_STEPS):
+        factor, freedom = noise_variance(found)
+        if not factor > 0:
+            break
+        size *= float(np.sqrt(factor))
+        sd = None if noise.sd is None else np.asarray(noise.sd * size)
+        root = None if noise.root is None else np.asarray(noise.root * size)
+        scaled = replace(problem, noise=replace(noise, sd=sd, root=root))
+        found = fit(scaled, refresh=refresh, what=what, start=found.linear.at)
+        if abs(factor - 1) < _SAME:
+            break
+    return found, size**2, freedom
