@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtr, chdtri
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
@@ -47,6 +47,10 @@ _FEW = 8.0
 """Independent readings below which the size of a correlated noise is hardly known."""
 _COARSE = 0.5
 """Noise in steps of the scale from which rounding is a part of the scatter."""
+_LITTLE = 0.5
+"""Degrees of freedom."""
+_TOO_GOOD = 1e-6
+"""Probability of so small residuals of rounded readings below which they are not rounded."""
 _DIGITS = 1e-12
 """Scatter that is due to the digits of floating-point numbers, relative to the largest reading."""
 _SAME = 1e-6
@@ -109,7 +113,7 @@ def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
         what = f"The noise of neighbouring {observed.what.removeprefix('the ')} is correlated ({along.phi:.2f})"
         if along.independent < _FEW and not observed.problem.noise.stated:
             doubt = (
-                f"{what}: they are worth {along.independent:.2g} independent ones, so that their noise is hardly known and "
+                f"{what}: they are worth {along.independent:.2g} independent ones. Their noise is hardly known, and "
                 "the uncertainties may be too small. State the noise, or measure more of them."
             )
         else:
@@ -126,10 +130,24 @@ def fitted(observed: Observed, problem: Problem, before: Fit) -> Fit:
 
 
 def steps_of(observed: Observed) -> Array:
-    """Return the step of the scale of each number of a reading, (r,), stated or as the readings show it; 0 = none."""
-    y = column(observed.problem.readings)
-    steps = np.array([resolution.step_of(one) for one in y.T]) if observed.resolution is None else observed.resolution
-    return np.broadcast_to(np.asarray(steps, dtype=float), (y.shape[1],))
+    """Return the step of the scale of each number of a reading, (r,), stated or as the readings show it; 0 = none.
+
+    Readings that fulfil the equation far better than rounded ones can, such as expected ones, have none.
+    """
+    problem = observed.problem
+    y = column(problem.readings)
+    if observed.resolution is not None:
+        return np.broadcast_to(np.asarray(observed.resolution, dtype=float), (y.shape[1],))
+    steps = np.array([resolution.step_of(one) for one in y.T])
+    if not steps.any():
+        return steps
+    first = fit(problem, refresh=observed.refresh, what=observed.what)
+    # Repeats that are rounded alike agree; all other readings have independent rounding errors.
+    repeats = float((first.linear.used * (1 - 1 / resolution.alike(problem))[:, None]).sum())
+    variance = np.median(np.diagonal(problem.noise.covariance(y.shape), axis1=1, axis2=2), axis=0)
+    in_steps = first.chi2 * float((12 * variance[steps > 0] / np.square(steps[steps > 0])).max())
+    freedom = first.freedom - repeats
+    return np.zeros_like(steps) if freedom > _LITTLE and chdtr(freedom, in_steps) < _TOO_GOOD else steps
 
 
 def searchable(observed: Observed, problem: Problem) -> Problem:
