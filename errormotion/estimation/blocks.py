@@ -63,8 +63,16 @@ class Table:
         """The index as (n, w)."""
         return self.index.reshape(len(self.index), self.slots)
 
+    @cached_property
+    def common(self) -> bool:
+        """Whether all readings see the same rows without weights, such as those of a table of one row."""
+        return self.weight is None and len(self.index) > 0 and bool((self.index == self.index[0]).all())
+
     def rows(self, table: Array) -> Array:
-        """Return the rows of a table (size, width) as the equation receives them."""
+        """Return the rows of a table (size, width) as the equation receives them; read-only where all are the same."""
+        if self.common:
+            one = table[self.index[0]]
+            return np.broadcast_to(one, (len(self.index), *one.shape))
         if self.index.ndim == 1:
             return np.asarray(table[self.index])
         if self.weight is None:

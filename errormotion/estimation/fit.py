@@ -2,7 +2,8 @@
 
 The objective is ``Q = r' V^-1 r + sum ((x - x0) / sd)^2`` over readings and priors. Each step solves the normal
 equations of the linearised problem and is halved until Q decreases. The iteration ends by the Newton decrement
-``g' step``, the decrease of Q that the next step promises, and not by the size of the step: it has no unit.
+``g' step``, the decrease of Q that the next step promises, and not by the size of the step: it has no unit. A decrement
+that rounding of the numbers in the residuals explains ends it as well: with many or precise readings it is larger.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from errormotion.errors import FitError
 from errormotion.estimation.blocks import Block
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.normal import Normal, SingularError
-from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised
+from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised, problem_block
 
 __all__ = ["Fit", "fit"]
 
@@ -33,6 +34,8 @@ STALLED = 1e-10
 MAX_ITERATIONS = 50
 HALVINGS = 20
 EPS = float(np.finfo(float).eps)
+OPERATIONS = 8.0
+"""Rounding errors of a residual, in units of those of the readings and unknowns in it."""
 ROUNDING = 1e-12
 """Increase of Q, relative to Q, that is regarded as rounding."""
 _ROWS = 4096
@@ -166,7 +169,9 @@ def fit(
         unit = _unit(linear)
         if refresh is not None:
             problem = refresh(problem, type(problem.unknowns)(*at.tables))
-        if decrement <= DECREMENT * unit or (decrement > 0.1 * last and decrement <= STALLED * unit):
+        if decrement <= max(DECREMENT * unit, _rounding(linear)):
+            break
+        if decrement > 0.1 * last and decrement <= STALLED * unit:
             break
         last = decrement
     else:
@@ -225,10 +230,20 @@ def _unit(linear: Linear) -> float:
 
 
 def _rounding(linear: Linear) -> float:
-    """Return the sum of squares of the errors that rounding of the readings makes in the whitened residuals."""
-    y = column(linear.problem.y)
-    size = np.abs(linear.whitener).sum(axis=2) * np.abs(y).max(axis=1, initial=0.0, keepdims=True)
-    return float(np.sum(np.square(EPS * size)))
+    """Return the sum of squares of the errors in the whitened residuals by rounding of readings and unknowns."""
+    noise, number = linear.problem.noise, linear.numbering
+    y = np.abs(column(linear.problem.y))
+    if noise.sd is None:
+        size = np.abs(linear.whitener).sum(axis=2) * y.max(axis=1, initial=0.0, keepdims=True)
+    else:
+        # A number with the standard deviation s contributes at most y / s.
+        sd = column(np.asarray(noise.sd, dtype=float))
+        most = np.max(y / np.where(sd > 0, sd, np.inf), axis=1, initial=0.0, keepdims=True)
+        size = np.where(linear.used, most, 0.0)
+    if number.local is not None:
+        table = np.abs(linear.at.tables[number.local])
+        size += np.einsum("nmwp,nwp->nm", np.abs(linear.local), table[problem_block(linear).index2])
+    return float(np.sum(np.square(OPERATIONS * EPS * size)))
 
 
 def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:

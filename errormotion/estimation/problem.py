@@ -16,7 +16,7 @@ from errormotion.estimation.blocks import Block, Constant, Index, Noise, Table
 from errormotion.estimation.derivatives import along, by_rows, column
 from errormotion.estimation.normal import Normal, factorised
 
-__all__ = ["READINGS", "Linear", "Problem", "linearised"]
+__all__ = ["READINGS", "Linear", "Problem", "by_slot", "linearised"]
 
 READINGS = "readings"
 """Name of the derivatives by the readings among analytic ones."""
@@ -46,6 +46,8 @@ class Problem:
         ``derivatives(y, x, c)`` returns analytic derivatives of the residuals, (n, m, width) or (n, m, w, width), by
         name, for any of the unknowns, and as `READINGS` those by the numbers of the readings, (n, m, r); those of the
         others are differences.
+    constant_derivatives : callable, optional
+        The same for any of the constants that are not adjusted.
     """
 
     equation: Callable[[Array, Any, Any], Array]
@@ -56,6 +58,7 @@ class Problem:
     reading_scale: float | Array = 1.0
     gauge: Mapping[str, Array] | None = None
     derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
+    constant_derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
 
     @cached_property
     def y(self) -> Array:
@@ -232,20 +235,48 @@ class Linear:
         normal = factorised(band, G, D, self.gauge())
         return normal, -a, -(b + prior * offset)
 
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether each reading sees its own row of the eliminated block, in their order."""
+        index = problem_block(self).index2
+        return index.shape == (len(problem_block(self).start), 1) and bool((index[:, 0] == np.arange(len(index))).all())
+
+    @cached_property
+    def same_columns(self) -> bool:
+        """Whether all readings see the same unknowns of the border."""
+        return self.columns.size > 0 and bool((self.columns == self.columns[0]).all())
+
     def sums(self) -> tuple[list[Array], Array, Array]:
         """Return the sums of products of derivatives: the band of T, G, and D."""
         number, q = self.numbering, self.numbering.size
         b = self.columns.shape[1]
-        pairs = np.einsum("nmi,nmj->nij", self.border, self.border)
-        rows = np.broadcast_to(self.columns[:, :, None], pairs.shape)
-        cols = np.broadcast_to(self.columns[:, None, :], pairs.shape)
-        D = _summed(rows * (q + 1) + cols, pairs, (q + 1) ** 2).reshape(q + 1, q + 1)[:q, :q]
+        if self.same_columns:
+            flat = self.border.reshape(-1, b)
+            D = np.zeros((q + 1, q + 1))
+            pair: Any = np.ix_(self.columns[0], self.columns[0])
+            np.add.at(D, pair, flat.T @ flat)
+        else:
+            pairs = np.einsum("nmi,nmj->nij", self.border, self.border)
+            rows = np.broadcast_to(self.columns[:, :, None], pairs.shape)
+            cols = np.broadcast_to(self.columns[:, None, :], pairs.shape)
+            D = _summed(rows * (q + 1) + cols, pairs, (q + 1) ** 2).reshape(q + 1, q + 1)
+        D = D[:q, :q]
         if number.local is None:
             return [np.zeros((0, 1, 1))], np.zeros((0, 1, q)), D
         block = problem_block(self)
         R, p = block.start.shape
         index, A = block.index2, self.local
         w = A.shape[2]
+        if self.in_order:
+            transposed = np.swapaxes(A[:, :, 0], 1, 2)
+            G = np.zeros((q + 1, R, p))
+            if self.same_columns:
+                np.add.at(G, self.columns[0], np.moveaxis(transposed @ self.border, 2, 0))
+            elif b:
+                product = np.swapaxes(transposed @ self.border, 1, 2)
+                at: Any = (self.columns, np.arange(R)[:, None])
+                np.add.at(G, at, product)
+            return [transposed @ A[:, :, 0]], np.ascontiguousarray(np.moveaxis(G[:q], 0, 2)), D
         band = [np.zeros((R, p, p)) for _ in range(number.band + 1)]
         G = np.zeros((R, p, q + 1))
         inner = np.arange(p * p).reshape(p, p)
@@ -275,11 +306,18 @@ class Linear:
         single = residual.ndim == 2
         r = residual[..., None] if single else residual
         k, q = r.shape[2], self.numbering.size
-        product = np.einsum("nmb,nmk->nbk", self.border[only], r)
-        flat = self.columns[only][:, :, None] * k + np.arange(k)
-        b = _summed(flat, product, (q + 1) * k).reshape(q + 1, k)[:q]
+        if self.same_columns:
+            b = np.zeros((q + 1, k))
+            np.add.at(b, self.columns[0], np.tensordot(self.border[only], r, axes=((0, 1), (0, 1))))
+        else:
+            product = np.einsum("nmb,nmk->nbk", self.border[only], r)
+            flat = self.columns[only][:, :, None] * k + np.arange(k)
+            b = _summed(flat, product, (q + 1) * k).reshape(q + 1, k)
+        b = b[:q]
         if self.numbering.local is None:
             a = np.zeros((0, 1, k))
+        elif rows is None and self.in_order:
+            a = np.swapaxes(self.local[:, :, 0], 1, 2) @ r
         else:
             block = problem_block(self)
             R, p = block.start.shape
@@ -384,19 +422,17 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
 def _derivatives(problem: Problem, tables: list[Table], values: list[Array], given: Mapping[str, Array]) -> list[Array]:
     """Return the derivatives (n, m, w, width) by all unknowns, then by the adjusted constants."""
     count = len(problem.unknowns)
-    known: dict[int, Array] = {}
-    for k, name in enumerate(problem.unknowns._fields):
-        if name not in given:
-            continue
-        J, table = given[name], tables[k]
-        whole = J[:, :, None, :] if J.ndim == 3 else J
-        if table.weight is not None:
-            whole = whole * table.weight[:, None, :, None]
-        known[k] = whole
+    known = {k: by_slot(given[name], tables[k]) for k, name in enumerate(problem.unknowns._fields) if name in given}
     wanted = [k for k in range(count) if k not in known] + [count + k for k in problem.adjusted]
     found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted)
     by_number = {**known, **dict(zip(wanted, found, strict=True))}
     return [by_number[k] for k in [*range(count), *(count + k for k in problem.adjusted)]]
+
+
+def by_slot(J: Array, table: Table) -> Array:
+    """Return analytic derivatives (n, m, width) or (n, m, w, width) by the rows w that each reading sees."""
+    whole = J[:, :, None, :] if J.ndim == 3 else J
+    return whole if table.weight is None else whole * table.weight[:, None, :, None]
 
 
 def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_], by_readings: Array | None) -> Array:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,12 +24,14 @@ from errormotion.errors import FitError
 from errormotion.estimation.blocks import Constant, Index, Table
 from errormotion.estimation.derivatives import by_rows, column
 from errormotion.estimation.fit import Fit
-from errormotion.estimation.problem import Problem
+from errormotion.estimation.problem import Problem, by_slot
 
 __all__ = ["Errors", "Places", "Source", "errors_of"]
 
 _CHUNK = 64
 """Sources whose effects are computed at a time."""
+_ROWS = 4096
+"""Places whose effects are rearranged at a time, in the cache of a core."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +50,13 @@ class Places:
         The equation receives sums of rows with these weights.
     count : int
         Number of places.
+    only : sequence of str
+        Names of the tables that the errors depend on; default: all of which a place has a row.
     """
 
     equation: Callable[[Any, Any], Array]
     count: int
+    only: Sequence[str] = ()
     rows: Mapping[str, Index] = field(default_factory=dict)
     weights: Mapping[str, Array] = field(default_factory=dict)
 
@@ -64,6 +70,8 @@ class Places:
 
     def _table(self, name: str, table: Table, size: int) -> Table | None:
         index = self.rows.get(name)
+        if self.only and name not in self.only:
+            return None
         if index is None:
             if size not in (1, self.count):
                 return None
@@ -98,7 +106,7 @@ class Errors:
     own: Array
     sources: list[Source]
 
-    @property
+    @cached_property
     def influence(self) -> Array:
         """Effects of all sources, (source, place, d)."""
         return np.array([source.effect for source in self.sources]).reshape(-1, *self.value.shape)
@@ -170,9 +178,13 @@ def errors_of(fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "r
             sources += [Source(f"{shared} {k + 1}", shared, K[..., k]) for k in range(K.shape[2]) if K[..., k].any()]
     else:
         own = own * factor
+    given: Mapping[str, Array] = {}
+    if problem.constant_derivatives is not None:
+        rows = [table.rows(value) for table, value in zip(problem.tables, values, strict=True)]
+        given = problem.constant_derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
     for k, constant in enumerate(problem.constants):
         if not constant.adjust and constant.sources:
-            sources += _of_constant(fit, tables, J, k, local, index, E)
+            sources += _of_constant(fit, tables, J, k, local, index, E, given)
     return Errors(value, own, sources)
 
 
@@ -235,31 +247,56 @@ def _named(constant: Constant, name: str) -> tuple[Sequence[str], Sequence[str]]
 
 
 def _of_constant(
-    fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array], k: int, local: Array, index: Index, E: Array
+    fit: Fit,
+    tables: Mapping[int, Table],
+    J: Mapping[int, Array],
+    k: int,
+    local: Array,
+    index: Index,
+    E: Array,
+    given: Mapping[str, Array],
 ) -> list[Source]:
     """Return the sources of a constant that is taken as it is."""
     problem, linear = fit.problem, fit.linear
     constant: Constant = problem.constants[k]
+    name = problem.constants._fields[k]
     at = len(problem.unknowns) + k
-    values = [*linear.at.tables, *problem.constant_tables(linear.at)]
-    R = by_rows(lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, [at])[0]
-    white = np.einsum("nij,njwc->niwc", linear.whitener, np.where(linear.used[:, :, None, None], R, 0.0))
-    names, identities = _named(constant, problem.constants._fields[k])
+    if name in given:
+        R = by_slot(given[name], constant)
+    else:
+        values = [*linear.at.tables, *problem.constant_tables(linear.at)]
+        R = by_rows(lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, [at])[0]
+    white = linear.whitener @ np.where(linear.used[:, :, None, None], R, 0.0).reshape(*linear.used.shape, -1)
+    names, identities = _named(constant, name)
     found = []
     for first in range(0, constant.sources, _CHUNK):
         part = slice(first, first + _CHUNK)
         factor = constant.factor[..., part]
-        change = np.einsum("niwc,nwcz->niz", white, factor[constant.index2])
-        a, b = linear.gradient(change)
-        x, z = fit.normal.solve(-a, -b)
-        effect = E @ z
+        effect = np.zeros((len(local), E.shape[1], factor.shape[2]))
         if at in J:
             effect += np.einsum("pdwc,pwcz->pdz", J[at], factor[tables[at].index2])
-        if linear.numbering.local is not None:
-            # x = T^-1 (-a - G z): E z contains -F z already
-            effect += local @ (x[index] + fit.normal.F[index] @ z)
+        if white.any():
+            if constant.common:
+                change = white @ factor[constant.index2[0]].reshape(-1, factor.shape[2])
+            else:
+                change = white @ factor[constant.index2].reshape(len(white), -1, factor.shape[2])
+            a, b = linear.gradient(change)
+            x, z = fit.normal.solve(-a, -b)
+            effect += E @ z
+            if linear.numbering.local is not None:
+                # x = T^-1 (-a - G z): E z contains -F z already
+                effect += local @ (x[index] + fit.normal.F[index] @ z)
         found += [
-            Source(names[first + j], constant.group, effect[..., j], identities[first + j])
-            for j in range(effect.shape[2])
+            Source(names[first + j], constant.group, each, identities[first + j])
+            for j, each in enumerate(_by_source(effect))
         ]
+    return found
+
+
+def _by_source(effect: Array) -> Array:
+    """Return effects (place, d, k) in the order of memory (k, place, d)."""
+    places, d, k = effect.shape
+    found = np.empty((k, places, d))
+    for first in range(0, places, _ROWS):
+        found[:, first : first + _ROWS] = np.moveaxis(effect[first : first + _ROWS], 2, 0)
     return found

@@ -171,7 +171,8 @@ def identify(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> 
         The data do not determine the result.
     """
     solved = solve(model.observe(raw, settings))
-    origin = provenance.make(settings, raw, None, steps=[f"least squares of {solved.observed.what}"])
+    steps = [f"least squares of {solved.observed.what}"]
+    origin = provenance.make(settings, raw, None, steps=steps, raw_hash=solved.observed.raw_hash)
     return dataset(model, solved, raw, info, origin)
 
 
@@ -202,7 +203,7 @@ def dataset(
         "source_groups": [source.group for source in errors.sources],
         "source_ids": {name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
         "extras": dict(observed.extras) | _of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum)),
-        "start": "" if planned else start_of(raw),
+        "start": "" if planned else start_of(raw, observed.zero),
         "measured": None if planned else raw.attrs,
         **observed.attributes,
     }
@@ -218,12 +219,10 @@ def dataset(
         found = build_errors(
             _placed(errors.value, observed, shape),
             _square(errors.covariance, observed, shape),
-            influence=np.array([_placed(source.effect, observed, shape) for source in errors.sources]).reshape(
-                len(names), *shape, 6
-            ),
+            influence=_placed(errors.influence, observed, (len(names), *shape)),
             **common,
         )
-    return found.assign_attrs(notes=[note for note in notes if note] or [""])
+    return found.assign_attrs(observed.attrs, notes=[note for note in notes if note] or [""])
 
 
 def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
@@ -262,9 +261,10 @@ def _shape(observed: Observed) -> tuple[int, ...]:
 
 
 def _placed(values: Array, observed: Observed, shape: tuple[int, ...]) -> Array:
-    """Return values (place, d) as (..., 6), NaN for the freedoms that the model does not determine."""
-    found = np.full((len(values), 6), np.nan)
-    found[:, [DOF.index(name) for name in observed.freedoms]] = values
+    """Return values (..., place, d) as (..., 6), NaN for the freedoms that the model does not determine."""
+    found = np.full((*values.shape[:-1], 6), np.nan)
+    for k, name in enumerate(observed.freedoms):
+        found[..., DOF.index(name)] = values[..., k]
     return found.reshape(*shape, 6)
 
 

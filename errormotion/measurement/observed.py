@@ -98,6 +98,12 @@ class Observed:
         Further variables of the result that follow from the raw data.
     attributes : mapping
         Further arguments of `errormotion.datasets.build_errors`.
+    attrs : mapping
+        Further attributes of the error dataset.
+    zero : float
+        Time of the raw data that is time 0 of the result, s.
+    raw_hash : str, optional
+        Hash of the raw data, where their reading gave it; otherwise they are read once more.
     notes : sequence of str
         What the reader of the raw data noticed.
     doubts : sequence of str
@@ -136,6 +142,9 @@ class Observed:
     finish: Callable[[Solved], Solved] | None = None
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+    zero: float = 0.0
+    raw_hash: str | None = None
     notes: Sequence[str] = ()
     doubts: Sequence[str] = ()
 

@@ -260,3 +260,77 @@ def test_one_place_has_no_shared_part() -> None:
     result = errors_of(found, Places(lambda x, c: x.beam, 1))
     assert result.sources == []
     assert result.own[0] == pytest.approx(np.linalg.inv(X.T @ X), rel=1e-9)
+
+
+@pytest.mark.parametrize("order", ["by target", "mixed"])
+def test_readings_in_the_order_of_their_targets_have_the_same_errors(order: str) -> None:
+    """With one reading of each target, and offsets that all of them see: the sums of the ordered readings are short."""
+    n, rng = 9, np.random.default_rng(2)
+    slope = rng.normal(size=n)
+    place = np.arange(n) if order == "by target" else rng.permutation(n)
+    far = np.tile([0, 1], (n, 1))
+
+    def residual(y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
+        both = x.offset[:, 0] + slope[place][:, None] * x.offset[:, 1]
+        return np.asarray(y - x.error * [1.0, 2.0] - both - slope[place][:, None] * c.scale - c.temperature)
+
+    model = Problem(
+        equation=residual,
+        readings=rng.normal(0.0, SD, (n, 2)),
+        unknowns=Unknowns(
+            Block(start=np.zeros((n, 2)), index=place, scale=1.0),
+            Block(start=np.zeros((2, 2)), index=far, scale=1.0, prior=PRIOR, group="drift"),
+        ),
+        constants=Known(
+            Constant(
+                value=np.ones((1, 2)), factor=1e-6 * np.eye(2)[None], index=np.zeros(n, int), scale=1.0, group="a"
+            ),
+            Constant(
+                value=np.zeros((n, 2)), factor=1e-6 * rng.normal(size=(n, 2, 3)), index=place, scale=1.0, group="b"
+            ),
+        ),
+        noise=Noise(sd=np.full((n, 2), SD)),
+    )
+    found = errors_of(fit(model), Places(lambda x, c: x.error, n, only=("error",)))
+    # Two numbers determine the two unknowns of a place: what else changes the readings changes its errors.
+    gain = np.array([-1.0, -0.5])
+    effects = {group: np.array([s.effect for s in found.sources if s.group == group]) for group in ("a", "b", "drift")}
+    of_a = gain * slope[:, None] * 1e-6 * np.eye(2)[:, None]
+    assert effects["a"] == pytest.approx(of_a, abs=1e-9 * 1e-6)
+    of_b = np.moveaxis(model.constants.temperature.factor, 2, 0) * gain
+    assert effects["b"] == pytest.approx(of_b, abs=1e-8 * 1e-6)
+    of_drift = np.stack([PRIOR * gain * w[:, None] * np.eye(2)[k] for w in (np.ones(n), slope) for k in range(2)])
+    assert effects["drift"] == pytest.approx(of_drift, abs=1e-8 * PRIOR)
+    assert found.own == pytest.approx(np.tile(np.diag(np.square(SD * gain)), (n, 1, 1)), abs=1e-8 * SD**2)
+
+
+def test_derivatives_by_constants_may_be_given() -> None:
+    called = []
+
+    def derivatives(y: Array, x: Any, c: Any) -> dict[str, Array]:
+        called.append(1)
+        return {"temperature": np.full((y.size, 1, 1), -11e-6) * POSITION[TARGET][:, None, None]}
+
+    plain = problem(np.zeros(TARGET.size))
+    given = replace(plain, constant_derivatives=derivatives)
+    by_differences, analytic = (errors_of(fit(each), Places(errors, TARGETS)) for each in (plain, given))
+    assert called
+    for one, other in zip(by_differences.sources, analytic.sources, strict=True):
+        assert other.effect == pytest.approx(one.effect, rel=1e-6, abs=1e-15)
+
+
+def test_a_source_that_no_reading_sees_acts_on_the_errors_only() -> None:
+    unseen = problem(np.zeros(TARGET.size))
+    blind = replace(unseen, equation=lambda y, x, _: y - x.error[:, 0] - x.offset[:, 0])
+    found = errors_of(fit(blind), Places(errors, TARGETS))
+    effect = next(source.effect[:, 0] for source in found.sources if source.group == "scale")
+    assert effect == pytest.approx(0.5 * POSITION * 2e-6, rel=1e-7)
+    expansion = next(source.effect for source in found.sources if source.group == "expansion")
+    assert not expansion.any()
+
+
+def test_a_table_that_the_errors_do_not_depend_on_is_named() -> None:
+    found = fit(problem(np.zeros(TARGET.size)))
+    places = Places(lambda x, c: x.error + 0.0 * np.nan_to_num(c.scale), TARGETS, only=("error",))
+    maps = places.tables(found.problem, [*found.linear.at.tables, *found.problem.constant_tables(found.linear.at)])
+    assert [each is None for each in maps] == [False, True, True, True]

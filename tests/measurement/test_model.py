@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
@@ -292,3 +293,15 @@ def test_simulated_data_state_that_no_instrument_measured() -> None:
     raw, _ = METHOD.simulate(SETTINGS, 1)
     errors = METHOD.identify(raw, SETTINGS)
     assert simulated(of(errors)) == "the provenance marks them as simulated"
+
+
+def test_attributes_hash_and_start_of_the_result_are_those_that_the_model_states() -> None:
+    class Stating(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            return replace(super().observe(raw, settings), attrs={"mode": "slow"}, zero=90.0, raw_hash="abc")
+
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = Stating().identify(raw.assign_attrs(start="2026-03-02T07:00:00+00:00"), SETTINGS)
+    assert errors.attrs["mode"] == "slow"
+    assert errors.attrs["start"].startswith("2026-03-02T07:01:30")
+    assert json.loads(errors.attrs["provenance"])["raw"]["hash"] == "abc"
