@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.spindle_drift.schema import SCHEMA
 from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
+from errormotion.methods.spindle_drift.settings import TrialSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -14,16 +16,18 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
+    from errormotion.measurement import Observed
+    from errormotion.plugins import Redrawing
 
 
-class SpindleDrift:
+class SpindleDrift(ModelMethod):
     """Thermal displacement and tilt of a spindle, from five distance sensors on a bar."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="spindle_drift",
         summary="Spindle drift with five sensors on a bar, ISO 230-3: beam detection and drift",
         status="simulated_only",
-        version="3",
+        version="4",
         cannot_see=(
             "the rotation about the spindle axis (EC)",
             "errors within one turn of the spindle, which are averaged out",
@@ -41,7 +45,6 @@ class SpindleDrift:
     simulate = lazy("errormotion.methods.spindle_drift.simulation:simulate")
     truth = lazy("errormotion.methods.spindle_drift.simulation:truth_of")
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
-    redrawing = lazy("errormotion.methods.spindle_drift.redrawing:redrawing")
 
     def acquire(
         self, bench: Bench, settings: DriftSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
@@ -127,15 +130,38 @@ class SpindleDrift:
             from errormotion.methods.spindle_drift.identification.detection import identify_beams
 
             return identify_beams(checked, settings, self.info.id, self.info.version)
-        from errormotion.methods.spindle_drift.identification.drift import identify_drift
+        from errormotion.measurement.identification import identify
 
-        return identify_drift(checked, settings, self.info.id, self.info.version)
+        return identify(self, checked, settings, self.info)
+
+    def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+        """Return what a drift record means; see ``model``."""
+        from errormotion.methods.spindle_drift.model import observe
+
+        return observe(raw, settings)
+
+    def expected(self, settings: DriftSettings) -> xr.Dataset:
+        """Return the raw data of a test without noise; see ``planning``."""
+        from errormotion.methods.spindle_drift.planning import expected
+
+        return expected(settings)
 
     def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance. See ``planning``."""
-        from errormotion.methods.spindle_drift.planning import plan
+        """Return an error dataset of zeros with the expected covariance."""
+        its = TrialSettings.of(settings or DriftSettings())
+        if its.procedure == "beam_detection":
+            from errormotion.methods.spindle_drift.planning import plan_beams
 
-        return plan(settings or DriftSettings(), self.info.id, self.info.version)
+            return plan_beams(its, self.info.id, self.info.version)
+        return super().plan(its)
+
+    def redrawing(self, raw: xr.Dataset, settings: DriftSettings, errors: xr.Dataset) -> Redrawing:
+        """Return the sources of the uncertainty of raw data, for the Monte Carlo evaluation."""
+        if "sphere_radius" in raw:
+            from errormotion.methods.spindle_drift.redrawing import redrawing_of_beams
+
+            return redrawing_of_beams(raw, settings, errors)
+        return super().redrawing(raw, TrialSettings.of(settings), errors)
 
 
 def _beam_text(chunk: xr.Dataset) -> str:

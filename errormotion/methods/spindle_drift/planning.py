@@ -1,17 +1,17 @@
-"""Expected uncertainty of a planned measurement."""
+"""Raw data as a test is expected to give them, and the plan of a beam detection."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
-from errormotion.datasets import build_errors, provenance
-from errormotion.kinematics.beams import beam_errors
+from errormotion.arrays import Array
+from errormotion.kinematics.iso import DOF
 from errormotion.methods.spindle_drift.acquisition.motions import machine_axes
-from errormotion.methods.spindle_drift.identification.beams import fisher_bound
-from errormotion.methods.spindle_drift.identification.drift import identify_drift
+from errormotion.methods.spindle_drift.identification.beams import fisher_bound, sphere_reading
+from errormotion.methods.spindle_drift.identification.detection import identify_beams
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 
 if TYPE_CHECKING:
@@ -19,86 +19,110 @@ if TYPE_CHECKING:
 
 _PLANNED = "planned, not measured"
 _TYPICAL_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])  # EX, EY, EZ, m; EA, EB, rad
+_OFF_AXIS = 30e-6
+"""Distance along X and Y from the axis of the bar to the functional point, whose coordinates are rounded, m."""
+_LATER = 3600.0
+"""Time of the planned instant after the reference state, s."""
 
 
-def plan(settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Return an error dataset of zeros with the expected covariance, for the procedure of the settings."""
-    part = _plan_beams if settings.procedure == "beam_detection" else _plan_drift
-    return part(settings, method, version)
+def expected(settings: Settings) -> xr.Dataset:
+    """Return raw data without noise, for the procedure of the settings.
+
+    A frame is as drawn in ISO 230-3, with readings at mid-range.
+    """
+    return _expected_beams(settings) if settings.procedure == "beam_detection" else _expected_drift(settings)
 
 
-def _frame(settings: Settings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return origins, directions (5, 3) and bounds (5, 6, 6) of the beams of a frame as drawn in ISO 230-3."""
+def plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
+    """Return the identification of the expected beam detection, with values of 0."""
+    found = identify_beams(_expected_beams(settings), settings, method, version)
+    kept = found[[*DOF, "covariance", "beam_index"]].assign({name: 0.0 * found[name] for name in DOF})
+    return kept.assign_attrs(reference=_PLANNED)
+
+
+def _frame(settings: Settings) -> tuple[Array, Array]:
+    """Return origins and directions (5, 3) of the beams of a frame."""
     p = settings.layout
     near = p.bar_radius + p.standoff
     z1, z2 = p.levels
     origin = np.array([[near, 0, z1], [near, 0, z2], [0, near, z1], [0, near, z2], [0, 0, -p.standoff]])
-    direction = np.array([[-1.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]])
-    bounds = [
+    return origin, np.array([[-1.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]])
+
+
+def _expected_drift(settings: Settings) -> xr.Dataset:
+    """Return the means of the reference state, and of one later instant.
+
+    The beams are those of a detection with the stated steps. The later instant has a typical drift (5 um in X and Y,
+    20 um in Z, 0.1 mrad), because the effect of the uncertainty of the beams increases with the drift.
+    """
+    p = settings.layout
+    origin, direction = _frame(settings)
+    covariance = [
         fisher_bound(o, u, _centres(o, u, settings), settings.sphere_radius, p.step_noise)
         for o, u in zip(origin, direction, strict=True)
     ]
-    return origin, direction, np.array(bounds)
-
-
-def _plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
-    origin, direction, bounds = _frame(settings)
-    errors, covariance = beam_errors(origin, direction, origin, direction, bounds)
-    return build_errors(
-        errors,
-        covariance,
-        dims=("beam",),
-        coords={"beam": list(CHANNELS)},
-        component="beam",
-        machine="plan",
-        frame="machine",
-        functional_point=origin.mean(axis=0),
-        reference=_PLANNED,
-        method=method,
-        method_version=version,
-        provenance=provenance.make(settings, None, None),
-    )
-
-
-def _plan_drift(settings: Settings, method: str, version: str) -> xr.Dataset:
-    """Plan a drift: the reference state and one later instant.
-
-    A bar of the stated radius is in a frame as drawn in ISO 230-3, with readings at mid-range; the beams are those of a
-    detection with the stated steps. The later instant has a typical drift (5 um in X and Y, 20 um in Z, 0.1 mrad),
-    because the effect of the uncertainty of the beams increases with the drift.
-    """
-    p = settings.layout
-    origin, direction, covariance = _frame(settings)
     ex, ey, ez, ea, eb = _TYPICAL_DRIFT
     zs = np.array(p.levels)
-    still = np.full(5, p.standoff)
+    still = p.standoff - _OFF_AXIS * np.array([1.0, 1.0, 1.0, 1.0, 0.0])
     # Distances to first order: a displacement of the bar towards the sensor reduces the reading.
     moved = still + np.array([*-(ex + eb * zs), *-(ey - ea * zs), ez])
+    start = settings.reference_time or 0.0
+    means = max(round((settings.reference_average or 0.0) / settings.average), 1)
+    time = np.unique([0.0, *(start + settings.average * np.arange(means)), start + _LATER])
     samples = max(1.0, settings.average * p.rate)
-    xyz = list("xyz")
-    raw = xr.Dataset(
-        {
-            "distance": (("channel", "time"), np.stack([still, moved], axis=1)),
-            "beam_origin": (("channel", "direction"), origin),
-            "beam_direction": (("channel", "direction"), direction),
-            "beam_covariance": (("channel", "p", "p_"), covariance),
-            "nominal_origin": (("channel", "direction"), origin),
-            "nominal_direction": (("channel", "direction"), direction),
-            "bar_radius": p.bar_radius,
-            "distance_noise": p.noise / np.sqrt(samples),
-            "level": ("height", zs),
-        },
-        coords={"channel": list(CHANNELS), "direction": xyz, "time": [0.0, 3600.0]},
-        attrs={"schema": SCHEMA, "machine": "plan"},
-    )
-    expected = identify_drift(raw, settings.model_copy(update={"running_end": None}), method, version)
-    for name in ("EX", "EY", "EZ", "EA", "EB"):
-        expected[name] = expected[name] * 0.0
-    kept = ["EX", "EY", "EZ", "EA", "EB", "EC", "covariance", "influence"]
-    return expected[kept].assign_attrs(reference=_PLANNED)
+    variables: dict[str, Any] = {
+        "distance": (("channel", "time"), np.where(time < time[-1], still[:, None], moved[:, None])),
+        "beam_origin": (("channel", "direction"), origin),
+        "beam_direction": (("channel", "direction"), direction),
+        "beam_covariance": (("channel", "p", "p_"), np.array(covariance)),
+        "nominal_origin": (("channel", "direction"), origin),
+        "nominal_direction": (("channel", "direction"), direction),
+        "bar_radius": p.bar_radius,
+        "distance_noise": p.noise / np.sqrt(samples),
+        "level": ("height", zs),
+    }
+    return xr.Dataset(variables, {**_LABELS, "time": time}, _ATTRS)
 
 
-def _centres(origin: np.ndarray, direction: np.ndarray, settings: Settings) -> np.ndarray:
+def _expected_beams(settings: Settings) -> xr.Dataset:
+    """Return readings of a stepped sphere whose residuals have exactly the stated noise.
+
+    The noise of a detection is that of its residuals. Readings without any would have no uncertainty: pseudo-random
+    residuals, without their part that another beam would explain, have the stated sum of squares.
+    """
+    origin, direction = _frame(settings)
+    sign = np.random.default_rng(0)
+    centres, scans, readings = [], [], []
+    for o, u in zip(origin, direction, strict=True):
+        centre = _centres(o, u, settings)
+        reading, jacobian = sphere_reading(o, u, centre, settings.sphere_radius)
+        seen = np.isfinite(reading)
+        J = jacobian[seen]
+        noise = sign.choice([-1.0, 1.0], len(J))
+        noise -= J @ np.linalg.lstsq(J, noise)[0]
+        freedom = len(J) - J.shape[1]
+        reading[seen] += settings.layout.step_noise * np.sqrt(freedom / (noise @ noise)) * noise
+        centres.append(centre)
+        scans.append(np.tile(machine_axes(u), (len(settings.depths), 1)))
+        readings.append(reading)
+    variables: dict[str, Any] = {
+        "distance": (("channel", "profile", "step"), np.array(readings)),
+        "sphere_centre": (("channel", "profile", "step", "direction"), np.array(centres)),
+        "sphere_radius": settings.sphere_radius,
+        "scan_direction": (("channel", "profile", "direction"), np.array(scans)),
+        "nominal_origin": (("channel", "direction"), origin),
+        "nominal_direction": (("channel", "direction"), direction),
+    }
+    return xr.Dataset(variables, {key: _LABELS[key] for key in ("channel", "direction")}, _ATTRS)
+
+
+def _centres(origin: Array, direction: Array, settings: Settings) -> Array:
+    """Return the centres (profile, step, 3) of the sphere: at each depth, scans along both axes across the beam."""
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
     middle = origin + (np.array(settings.depths) + settings.sphere_radius)[:, None] * direction
-    return np.asarray(middle[:, None, None] + offsets[:, None] * machine_axes(direction)[:, None])
+    every = middle[:, None, None] + offsets[:, None] * machine_axes(direction)[:, None]
+    return np.asarray(every.reshape(-1, settings.steps, 3))
+
+
+_LABELS = {"channel": list(CHANNELS), "direction": list("xyz"), "height": ["L1", "L2"]}
+_ATTRS = {"schema": SCHEMA, "machine": "plan"}

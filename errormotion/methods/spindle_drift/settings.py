@@ -127,4 +127,9 @@ class Settings(PluginSettings):
 
 
 class TrialSettings(Settings):
-    """Settings of one trial of the Monte Carlo method, without results that have no effect on the errors."""
+    """Settings of a plan, or of one trial of the Monte Carlo method: without results that do not affect the errors."""
+
+    @classmethod
+    def of(cls, settings: Settings) -> TrialSettings:
+        """Return the same settings for a plan or a trial."""
+        return cls(**{name: getattr(settings, name) for name in Settings.model_fields})

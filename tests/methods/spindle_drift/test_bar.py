@@ -1,10 +1,10 @@
-"""The bar's axis from four distances, its end face, and their derivatives."""
+"""The bar's axis from four distances, and its errors against a reference."""
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis, state_jacobian
+from errormotion.methods.spindle_drift.identification.bar import errors_of, fit_axis, states
 
 R = 5e-3
 LEVELS = np.array([0.01, 0.05])
@@ -62,20 +62,27 @@ def test_parallel_beams_give_no_axis(beams):
     assert np.isnan(fit_axis(np.full((5, 2), 1e-3), origin, direction, R, LEVELS)).all()
 
 
-def test_derivatives_are_those_of_finite_differences(beams):
+def test_errors_are_the_motion_of_the_bar(beams):
+    """A bar turned about a point and displaced: the rotation across its axis, and the displacement of the point."""
     origin, direction = beams
-    distance = 1e-3 + np.random.default_rng(3).normal(0, 2e-5, (5, 1))
+    reference = states(np.full((5, 1), 1e-3), origin, direction, R, LEVELS)
+    point, w, shift = np.array([0.01, -0.02, 0.03]), np.array([3e-4, -2e-4, 0.0]), np.array([5e-6, -3e-6, 9e-6])
+    a0 = np.array([*reference[0, 3:], 1.0]) / np.linalg.norm([*reference[0, 3:], 1.0])
+    w -= a0 * (w @ a0)  # across the axis
+    a = np.cross(w, a0) + a0 * np.sqrt(1.0 - w @ w)
+    E = reference[0, :3] + shift - np.cross(w, point - reference[0, :3])
+    moved = np.array([[*E, *(a[:2] / a[2])]])
+    np.testing.assert_allclose(errors_of(moved, reference, point)[0], [*shift, *w[:2]], rtol=0, atol=1e-15)
+    # A rotation about the axis displaces the point along a circle about it.
+    turned = errors_of(reference, reference, point, 1e-4)[0]
+    np.testing.assert_allclose(turned[:3], 1e-4 * np.cross(a0, point - reference[0, :3]), rtol=0, atol=1e-18)
 
-    def state(p):
-        d, rows, radius = p[:5].reshape(5, 1), p[5:35].reshape(5, 6), p[35]
-        q = fit_axis(d, rows[:, :3], rows[:, 3:], radius, LEVELS)
-        a, E = end_point(q, d[4], rows[4, :3], rows[4, 3:], LEVELS)
-        return np.concatenate([a[0], E[0]])
 
-    p = np.concatenate([distance[:, 0], np.hstack([origin, direction]).ravel(), [R]])
-    h = 1e-7
-    numeric = np.array([(state(p + e) - state(p - e)) / (2 * h) for e in np.eye(36) * h]).T
-    q = fit_axis(distance, origin, direction, R, LEVELS)
-    da, dE = state_jacobian(q, distance, origin, direction, LEVELS)
-    # Central differences leave h^2 times the third derivative, about (1 / R)^2 relative.
-    np.testing.assert_allclose(np.concatenate([da[0], dE[0]]), numeric, rtol=1e-7, atol=1e-7)
+def test_an_origin_for_each_instant_is_that_of_a_displaced_frame(beams):
+    origin, direction = beams
+    shift = 1e-6 * np.random.default_rng(4).normal(size=(3, 5, 3))
+    distance = np.full((5, 3), 1e-3)
+    together = states(distance, origin + shift, direction, R, LEVELS)
+    for k in range(3):
+        alone = states(distance[:, :1], origin + shift[k], direction, R, LEVELS)
+        np.testing.assert_allclose(together[k], alone[0], rtol=0, atol=1e-14)

@@ -9,9 +9,8 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.methods.spindle_drift.identification.averaging import Averager, slices
-from errormotion.methods.spindle_drift.identification.bar import end_point, fit_axis
+from errormotion.methods.spindle_drift.identification.bar import errors_of, states
 from errormotion.methods.spindle_drift.identification.times import first_and_last
-from errormotion.methods.spindle_drift.identification.uncertainty import State, twist
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
@@ -32,8 +31,8 @@ class LiveDrift:
         self._settings = settings
         self._averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
         self._start: float | None = None
-        self._reference: State | None = None
-        self.errors = np.full(6, np.nan)
+        self._reference: Array | None = None
+        self.errors = np.full(5, np.nan)
 
     def update(self, chunk: xr.Dataset) -> str:
         """Add a chunk of the raw dataset; return the errors of its last known mean as a line of text."""
@@ -53,19 +52,15 @@ class LiveDrift:
             chunk[name].transpose("channel", "direction").values for name in ("beam_origin", "beam_direction")
         )
         levels, radius = chunk["level"].values, float(chunk["bar_radius"])
-
-        def state(columns: Array) -> State:
-            q = fit_axis(columns, origin, direction, radius, levels)
-            return State(columns, q, *end_point(q, columns[4], origin[4], direction[4], levels))
-
+        first, last = (states(each, origin, direction, radius, levels) for each in (mean[:, :1], mean[:, -1:]))
         if self._reference is None:
-            self._reference = state(mean[:, :1])
-        self.errors = twist(state(mean[:, -1:]), self._reference, self._reference.E[0])[0]
+            self._reference = first
+        self.errors = errors_of(last, self._reference, self._reference[0, :3])[0]
 
     def text(self) -> str:
         """Return the last errors in um and arcsec; an empty text before the first errors."""
-        if not np.isfinite(self.errors[:5]).all():
+        if not np.isfinite(self.errors).all():
             return ""
         x, y, z = self.errors[:3] * 1e6
-        a, b = self.errors[3:5] * _ARCSEC
+        a, b = self.errors[3:] * _ARCSEC
         return f"EX {x:+.2f} EY {y:+.2f} EZ {z:+.2f} um, EA {a:+.1f} EB {b:+.1f} arcsec"

@@ -6,9 +6,7 @@ four side readings. A beam with origin P, direction u and reading d touches the 
     g_i(q) = |S_i - line(q)| - r = 0,   i = X1, X2, Y1, Y2
 
 is solved by Newton's method for every instant. With n the unit vector from the axis to S and tau the position of its
-foot on AB, the derivative is
-
-    dg = n . (dP + u dd + d du) - dr - n . ((1 - tau) dA + tau dB)
+foot on AB, its derivative is -n . ((1 - tau) dA + tau dB).
 
 The end face is the plane through S_Z at right angles to the axis; E, where the axis meets it, carries the Z motion.
 Source: Geiselhart et al. (euspen 2024), section 2.4; derivatives by the authors of this package.
@@ -22,8 +20,6 @@ from errormotion.arrays import Array
 
 SIDE = 4
 """Number of side channels: X1, X2, Y1, Y2 come first, Z last."""
-PARAMETERS = 36
-"""Columns of a state Jacobian: five distances, then (origin, direction) of five beams, then the bar radius."""
 MAX_STEPS = 30
 _LAST_STEP = 1e-10
 """Step at which Newton's method ends, m: the remaining error is about its square by the radius, below 1e-17 m."""
@@ -37,7 +33,8 @@ def _fit(distance: Array, origin: Array, direction: Array, radius: float, z1: fl
     found = np.full((distance.shape[1], 4), np.nan)
     instant = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
     q = np.tile(start, (instant.size, 1))
-    surface = origin[:SIDE] + direction[:SIDE] * distance[:SIDE, instant].T[:, :, None]  # (instant, beam, 3)
+    at = np.broadcast_to(origin, (distance.shape[1], *origin.shape[-2:]))[instant, :SIDE]
+    surface = at + direction[:SIDE] * distance[:SIDE, instant].T[:, :, None]  # (instant, beam, 3)
     for _ in range(MAX_STEPS):
         slope = (q[:, 2:] - q[:, :2]) / height
         w = surface - np.concatenate([q[:, :2], np.full((len(q), 1), z1)], axis=1)[:, None]
@@ -86,8 +83,10 @@ def fit_axis(
     ----------
     distance : ndarray (>= 4, instant)
         Readings of X1, X2, Y1, Y2 in this order, m; further rows are ignored.
-    origin, direction : ndarray (>= 4, 3)
-        Beams: zero point, m, and unit vector.
+    origin : ndarray (>= 4, 3) or (instant, >= 4, 3)
+        Zero points of the beams, m.
+    direction : ndarray (>= 4, 3)
+        Their unit vectors.
     radius : float
         Bar radius, m.
     levels : ndarray (2,)
@@ -105,7 +104,8 @@ def fit_axis(
         known = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
         if known.size == 0:
             return unknown
-        start = start_axis(origin, direction, distance[:, known[0]], radius, levels)
+        first = origin if origin.ndim == 2 else origin[known[0]]
+        start = start_axis(first, direction, distance[:, known[0]], radius, levels)
     if not np.isfinite(start).all():
         return unknown
     return _fit(distance, origin, direction, radius, float(levels[0]), float(levels[1]), start)
@@ -114,7 +114,8 @@ def fit_axis(
 def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
     """Return axis directions (instant, 3) and the points E where the axis meets the end face (instant, 3), m.
 
-    ``origin`` and ``direction`` (3,) are those of the Z beam, ``distance_z`` (instant,) its readings.
+    ``origin`` (3,) or (instant, 3) and ``direction`` (3,) are those of the Z beam, ``distance_z`` (instant,) its
+    readings.
     """
     A = np.column_stack([q[:, 0], q[:, 1], np.full(len(q), levels[0])])
     B = np.column_stack([q[:, 2], q[:, 3], np.full(len(q), levels[1])])
@@ -125,61 +126,40 @@ def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, leve
     return a, A + a * along[:, None]
 
 
-def state_jacobian(q: Array, distance: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
-    """Return the derivatives of axis direction a and end point E by readings, beams and bar radius.
+def states(distance: Array, origin: Array, direction: Array, radius: float, levels: Array) -> Array:
+    """Return the states of the bar, (instant, 5): E, m, and the slopes a_x / a_z, a_y / a_z; arguments of `fit_axis`.
+
+    NaN where one of the five readings is NaN, or where no cylinder fits.
+    """
+    q = fit_axis(np.where(np.isfinite(distance).all(axis=0), distance, np.nan), origin, direction, radius, levels)
+    a, E = end_point(q, distance[4], origin[..., 4, :], direction[4], levels)
+    return np.column_stack([E, a[:, :2] / a[:, 2:]])
+
+
+def axis_direction(state: Array) -> list[Array]:
+    """Return the directions of the axis of states (n, 5) by coordinate, (n,)."""
+    slope = state[:, 3:].T
+    up = 1.0 / np.sqrt(1.0 + slope[0] ** 2 + slope[1] ** 2)
+    return [slope[0] * up, slope[1] * up, up]
+
+
+def errors_of(state: Array, reference: Array, point: Array, rotation: Array | float = 0.0) -> Array:
+    """Return EX EY EZ EA EB, (n, 5), m and rad, of states relative to a reference state.
 
     Parameters
     ----------
-    q : ndarray (instant, 4)
-        Fitted axes.
-    distance : ndarray (5, instant)
-        Readings, m.
-    origin, direction : ndarray (5, 3)
-        Beams.
-    levels : ndarray (2,)
-        Heights L1, L2, m.
-
-    Returns
-    -------
-    da, dE : ndarray (instant, 3, 36)
-        Columns: five distances, then origin and direction of each beam (5 x 6), then the bar radius.
+    state, reference : ndarray (n, 5), or one of them (1, 5)
+    point : ndarray (3,)
+        Functional point, m.
+    rotation : float or ndarray (n,)
+        About the axis of the reference state, rad.
     """
-    instants = len(q)
-    height = levels[1] - levels[0]
-    A = np.column_stack([q[:, 0], q[:, 1], np.full(instants, levels[0])])
-    slope = np.column_stack([(q[:, 2] - q[:, 0]) / height, (q[:, 3] - q[:, 1]) / height, np.ones(instants)])
-    norm = np.linalg.norm(slope, axis=1)
-    S = origin + direction * distance.T[:, :, None]
-    # The four side equations: M dq = n . dS - dr.
-    w = S[:, :SIDE] - A[:, None]
-    s = np.einsum("tci,ti->tc", w, slope) / (norm**2)[:, None]
-    n = w - s[..., None] * slope[:, None]
-    n /= np.linalg.norm(n, axis=2, keepdims=True)
-    tau = (s / height)[..., None]
-    M = np.concatenate([(1 - tau) * n[..., :2], tau * n[..., :2]], axis=2)
-    rhs = np.zeros((instants, SIDE, PARAMETERS))
-    for i in range(SIDE):
-        rhs[:, i, i] = n[:, i] @ direction[i]
-        rhs[:, i, 5 + 6 * i : 8 + 6 * i] = n[:, i]
-        rhs[:, i, 8 + 6 * i : 11 + 6 * i] = n[:, i] * distance[i][:, None]
-    rhs[:, :, -1] = -1.0
-    known = np.isfinite(M).all(axis=(1, 2))
-    dq = np.full((instants, 4, PARAMETERS), np.nan)
-    dq[known] = np.linalg.solve(M[known], rhs[known])
-    dA = np.zeros((instants, 3, PARAMETERS))
-    dA[:, :2] = dq[:, :2]
-    dslope = np.zeros_like(dA)
-    dslope[:, :2] = (dq[:, 2:] - dq[:, :2]) / height
-    a = slope / norm[:, None]
-    da = (dslope - a[:, :, None] * np.einsum("ti,tip->tp", a, dslope)[:, None]) / norm[:, None, None]
-    # E = A + a (a . (S_Z - A))
-    dS = np.zeros_like(dA)
-    dS[:, :, 4] = direction[4]
-    for k in range(3):
-        dS[:, k, 29 + k] = 1.0
-        dS[:, k, 32 + k] = distance[4]
-    v = S[:, 4] - A
-    along = np.einsum("ti,ti->t", a, v)
-    dalong = np.einsum("tip,ti->tp", da, v) + np.einsum("ti,tip->tp", a, dS - dA)
-    dE = dA + da * along[:, None, None] + a[:, :, None] * dalong[:, None]
-    return da, dE
+    a, a0, E, E0 = axis_direction(state), axis_direction(reference), state[:, :3].T, reference[:, :3].T
+    w = _cross(a0, a)
+    lever = _cross([w[k] + rotation * a0[k] for k in range(3)], [point[k] - E0[k] for k in range(3)])
+    return np.column_stack([*(E[k] - E0[k] + lever[k] for k in range(3)), w[0], w[1]])
+
+
+def _cross(v: list[Array], w: list[Array]) -> list[Array]:
+    """Return the vector product by coordinate."""
+    return [v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0]]

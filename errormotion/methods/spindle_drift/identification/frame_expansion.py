@@ -14,7 +14,6 @@ from errormotion.methods.spindle_drift.identification.record import Record, sens
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.spindle_drift.identification.uncertainty import State
     from errormotion.methods.spindle_drift.settings import Settings
 
 
@@ -193,17 +192,3 @@ def hats(time: Array, knots: int) -> Array:
     """Return weights (knot, instant) about evenly spaced knots over a record; their squares add up to one."""
     position = (time - time[0]) / max(float(np.ptp(time)), 1e-9) * (knots - 1)
     return np.asarray(np.sqrt(np.maximum(1.0 - np.abs(position - np.arange(knots)[:, None]), 0.0)))
-
-
-def readings_per_kelvin(warming: FrameWarming, state: State, origin: Array, direction: Array, levels: Array) -> Array:
-    """Return the correction of the readings per kelvin of the frame, (5, instant), m/K.
-
-    A displacement s of the origin of a beam changes its reading by -n . s / (n . u), n the surface normal.
-    """
-    A = np.column_stack([state.q[:, :2], np.full(len(state.q), levels[0])])
-    S = origin[:, None] + direction[:, None] * state.distance[:, :, None]
-    w = S - A
-    n = w - np.einsum("cti,ti->ct", w, state.a)[..., None] * state.a
-    n[4] = state.a
-    along = np.einsum("cti,ci->ct", n, direction)
-    return np.asarray(np.einsum("cti,ci->ct", n, warming.per_kelvin) / along)

@@ -66,6 +66,8 @@ class Record:
     scatter : ndarray (5,) or None
         Standard deviation of single readings within one mean at steady speed, m; None where the record consists of
         means, or has no spindle speed.
+    hash : str
+        Of the raw data, from the same pass.
     """
 
     averages: Averages
@@ -73,10 +75,11 @@ class Record:
     spindle_speed: Array | None
     scatter: Array | None
     weight: Array
+    hash: str
 
 
-def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -> Record:
-    """Average a record in one pass and constant memory; the hasher of ``raw`` takes part in it."""
+def average_record(raw: xr.Dataset, settings: Settings) -> Record:
+    """Average and hash a record in one pass and constant memory."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # The order is changed after reading: a lazy selection would read the store sample by sample.
     order = [list(raw["channel"].values).index(name) for name in CHANNELS]
@@ -85,19 +88,21 @@ def average_record(raw: xr.Dataset, settings: Settings, hasher: DatasetHasher) -
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
-    for piece in _pieces(raw, {"distance": averager, **slow_averagers}, order, hasher):
-        parts.append(piece.added_to(averager, "distance"))
-        for name in slow:
-            slow_parts[name].append(piece.added_to(slow_averagers[name], name))
-        if "spindle_speed" in slow and scatter is None:
-            turning = piece.values["spindle_speed"][0].astype(np.float64)
-            scatter = _scatter(values_of(piece.time), piece.values["distance"], turning, settings)
+    with DatasetHasher(raw) as hasher:
+        for piece in _pieces(raw, {"distance": averager, **slow_averagers}, order, hasher):
+            parts.append(piece.added_to(averager, "distance"))
+            for name in slow:
+                slow_parts[name].append(piece.added_to(slow_averagers[name], name))
+            if "spindle_speed" in slow and scatter is None:
+                turning = piece.values["spindle_speed"][0].astype(np.float64)
+                scatter = _scatter(values_of(piece.time), piece.values["distance"], turning, settings)
+        known_hash = hasher.value()
     parts.append(averager.finish())
     means = {name: join([*complete, slow_averagers[name].finish()]).mean for name, complete in slow_parts.items()}
     speed = means.get("spindle_speed")
     averages = join(parts)
     ones = np.ones(averages.mean.shape)
-    record = Record(averages, means.get("temperature"), None if speed is None else speed[0], scatter, ones)
+    record = Record(averages, means.get("temperature"), None if speed is None else speed[0], scatter, ones, known_hash)
     return _at_common_times(record, settings)
 
 
@@ -339,29 +344,24 @@ def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
     return found
 
 
-def run_out_at_rest(record: Record, reference: NDArray[np.int64], noise: float) -> list[tuple[str, str, Array]]:
-    """Return the effect of the run-out at rest for each channel and rest, as readings (5, instant), m.
+def run_out_at_rest(
+    record: Record, reference: NDArray[np.int64], noise: float
+) -> tuple[Array, NDArray[np.intp], list[int]]:
+    """Return the run-out of each channel at rest, (5,), m, and during which rest each mean was.
 
-    Each rest is one draw. A reference state at rest adds its draw to all errors outside of that rest. Empty where the
-    spindle always turns, always rests, or its speed is unknown.
+    Each rest is one draw. The rests are numbered; the means (n,), and last the reference state, state the position of
+    their rest in this list, or its length while the spindle turns. There are none where the spindle always turns,
+    always rests, or its speed is unknown.
     """
+    n = record.averages.time.size
     if record.scatter is None or record.spindle_speed is None:
-        return []
-    rests = ~turns(record.spindle_speed)
-    if rests.all() or not rests.any():
-        return []
-    spread = np.sqrt(np.maximum(record.scatter**2 - noise**2, 0.0))
-    found = []
-    edges = np.flatnonzero(np.diff(rests, prepend=False, append=False)).reshape(-1, 2)
-    for number, (first, end) in enumerate(edges, start=1):
-        if first <= reference[0] < end:
-            effect = -np.ones(rests.size)
-            effect[first:end] = 0.0
-        else:
-            effect = np.zeros(rests.size)
-            effect[first:end] = 1.0
-        for i in np.flatnonzero(spread > 0):
-            change = np.zeros((len(CHANNELS), rests.size))
-            change[i] = effect * spread[i]
-            found.append((f"run-out {CHANNELS[i]}, rest {number}", "run-out at rest", change))
-    return found
+        return np.zeros(len(CHANNELS)), np.zeros(n + 1, np.intp), []
+    still = ~turns(record.spindle_speed)
+    edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
+    if still.all():
+        edges = edges[:0]
+    rest = np.full(n + 1, len(edges), np.intp)
+    for k, (first, end) in enumerate(edges):
+        rest[first:end] = k
+    rest[-1] = rest[reference[0]]
+    return np.sqrt(np.maximum(record.scatter**2 - noise**2, 0.0)), rest, list(range(1, len(edges) + 1))
