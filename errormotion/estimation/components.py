@@ -42,6 +42,8 @@ NOISE = "noise"
 """Name of the variance of the noise, as a factor for the one in the weights."""
 FLOOR = 1e-8
 """Smallest variance in the final fit, of that with which an effect is as large as the noise of its estimate."""
+LEAST_NOISE = 1e-9
+"""Smallest variance of the noise, of that of the readings with all effects: less cannot be told from rounding."""
 CONVERGED = 1e-12
 """Increase of the likelihood that the next step promises, at which the scoring ends."""
 CHANGED = 1e-6
@@ -269,7 +271,7 @@ class _Contrasts:
         noise = len(unit) - 1 if self.names and self.names[-1] == NOISE else -1
         least = np.zeros(len(unit))
         if noise >= 0:
-            least[noise] = 1e-12
+            least[noise] = LEAST_NOISE
         value, score, information = self._likelihood(t * unit)
         for _ in range(MAX_STEPS):
             g, F = score * unit, information * unit * unit[:, None]
@@ -308,14 +310,18 @@ class _Contrasts:
         square = (self.c - float(self.b @ (d * v))) / s
         logdet = float(np.linalg.slogdet(K)[1]) if d.size else 0.0
         value = -0.5 * ((self.freedom - d.size) * np.log(s) + logdet + square)
-        score = np.array([-0.5 * float(np.sum(np.diagonal(Q)[i] - v[i] ** 2)) for i in self.which])
-        F = np.array([[0.5 * float(np.sum(Q[np.ix_(i, j)] ** 2)) for j in self.which] for i in self.which])
+        # column j: 1 for the effects of variance j
+        member = np.zeros((d.size, len(self.which)))
+        for j, i in enumerate(self.which):
+            member[i, j] = 1.0
+        score = -0.5 * (np.diagonal(Q) - v**2) @ member
+        F = 0.5 * member.T @ np.square(Q) @ member
         if noise:
             # s tr P = n - p - sum d_j Q_jj; s Z' P P Z = Q - Q D Q; s y' P P y = y' P y - sum d_j v_j^2
             trace = (self.freedom - float(d @ np.diagonal(Q))) / s
             PP = (np.diagonal(Q) - np.einsum("ij,j,ji->i", Q, d, Q)) / s
             score[-1] = -0.5 * (trace - (square - float(d @ v**2)) / s)
-            F[-1, :] = F[:, -1] = [0.5 * float(np.sum(PP[i])) for i in self.which]
+            F[-1, :] = F[:, -1] = 0.5 * PP @ member
             F[-1, -1] = 0.5 * (trace - float(d @ PP)) / s
         return value, score, F
 

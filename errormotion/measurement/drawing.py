@@ -54,9 +54,9 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
 
     def trial(data: xr.Dataset, its: Any) -> xr.Dataset:
         drawn = {name: np.asarray(data[name].values) for name in _drawn(problem) if name in data}
-        moved = replace(observed, problem=_moved(problem, data[READINGS].values.reshape(problem.readings.shape), drawn))
+        moved = _moved(problem, data[READINGS].values.reshape(problem.readings.shape), drawn)
         origin = provenance.make(its, None, None, steps=["trial"])
-        return dataset(model, solve(moved), raw, info, origin)
+        return dataset(model, solve(replace(observed, problem=moved, reliability=False)), raw, info, origin)
 
     return Redrawing(start, settings, sources, identify=trial)
 

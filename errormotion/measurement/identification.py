@@ -228,7 +228,7 @@ def dataset(
 def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     """Return residuals, exclusions and reliability of the readings, over their dims in the raw data."""
     recorded, given = solved.observed.recorded, solved.given
-    if recorded is None or solved.white.residual.size != given.readings.size:
+    if recorded is None or not solved.observed.reliability or solved.white.residual.size != given.readings.size:
         return {}
     name, dims = recorded
     shape = tuple(raw.sizes[dim] for dim in dims)

@@ -53,6 +53,8 @@ class Observed:
     recorded : tuple of str, and its dims
         The variable of the raw data that the readings are, and the dims in the order of the readings. With it, the
         framework simulates raw data.
+    reliability : bool
+        Whether the result has residuals, redundancy and smallest detectable errors of its ``recorded`` readings.
     shared : str
         Group in the budget of the noise of the readings as far as places have it in common.
     what : str
@@ -122,6 +124,7 @@ class Observed:
     datum: Datum | None = None
     sensitivity: Array | None = None
     recorded: tuple[str, tuple[str, ...]] | None = None
+    reliability: bool = True
     shared: str = "readings"
     what: str = "the readings"
     noise_cause: str = ""

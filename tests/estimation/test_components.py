@@ -256,3 +256,13 @@ def test_effects_that_are_not_separated_from_fixed_ones_are_refused() -> None:
     problem = one_way(np.random.default_rng(7).standard_normal((1, 1)))
     with pytest.raises(FitError, match="no redundancy"):
         components(problem)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_readings_without_any_noise_have_the_variances_of_their_effects(seed: int) -> None:
+    """Neither the steps of the fit nor the variances follow the rounding of the readings."""
+    problem, _, _ = positioning(4, 7, seed, sizes=np.array([3e-6, 2e-6, 1e-6, 1e-6]), sd=0.0)
+    found = components(problem)
+    of_run = problem.readings.reshape(2, 4, 7).mean(axis=(0, 2))  # half the sum of both approaches
+    assert found.variance[0] == pytest.approx(np.var(of_run, ddof=1), rel=1e-3)
+    assert found.variance[found.names.index(NOISE)] < 1e-7

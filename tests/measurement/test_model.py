@@ -305,3 +305,14 @@ def test_attributes_hash_and_start_of_the_result_are_those_that_the_model_states
     assert errors.attrs["mode"] == "slow"
     assert errors.attrs["start"].startswith("2026-03-02T07:01:30")
     assert json.loads(errors.attrs["provenance"])["raw"]["hash"] == "abc"
+
+
+def test_a_model_may_omit_the_reliability_of_its_readings() -> None:
+    class Plain(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            return replace(super().observe(raw, settings), reliability=False)
+
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = Plain().identify(raw, SETTINGS)
+    assert not {"residual", "redundancy", "smallest_error", "left_out"} & set(errors)
+    np.testing.assert_array_equal(errors["covariance"], METHOD.identify(raw, SETTINGS)["covariance"])
