@@ -7,7 +7,6 @@ from typing import Literal
 
 from errormotion.methods.linear_positioning.method import LinearPositioning
 from errormotion.methods.linear_positioning.settings import FREEDOMS, Diagonals, Freedom, Moving, Settings
-from errormotion.methods.linear_positioning.simulation import simulate
 from errormotion.plugins import MethodSubject
 
 OPTIONAL = (
@@ -24,7 +23,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     moving = Settings(freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
     warming = MethodSubject(
         LinearPositioning,
-        partial(simulate, moving),
+        partial(LinearPositioning().simulate, moving),
         raw_vectors={"end_position": "x", "functional_point": "point"},
         settings=moving.model_dump(exclude_unset=True),
         name="moving axis",
@@ -40,7 +39,7 @@ def _diagonals() -> MethodSubject:
     names = ("PP0", "NP0", "PPP", "NNP")
     return MethodSubject(
         LinearPositioning,
-        partial(simulate, Settings(diagonals=Diagonals(names=names), runs=RUNS, count=7)),
+        partial(LinearPositioning().simulate, Settings(diagonals=Diagonals(names=names), runs=RUNS, count=7)),
         raw_vectors={"stop_point": "point", "functional_point": "point"},
         settings={"diagonals": {"names": names}, "trials": 200},
         name="diagonals",
@@ -55,7 +54,7 @@ def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) 
     coordinate: Literal["x", "y"] = "x" if axis == "X" else "y"
     return MethodSubject(
         LinearPositioning,
-        partial(simulate, Settings(freedoms=freedoms, axis=axis, runs=RUNS, count=7)),
+        partial(LinearPositioning().simulate, Settings(freedoms=freedoms, axis=axis, runs=RUNS, count=7)),
         raw_vectors={"target_position": coordinate, "zero_position": coordinate, "functional_point": "point"},
         settings={"freedoms": freedoms, "axis": axis, "trials": 200},
         name=name,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.linear_positioning.schema import SCHEMA
+from errormotion.methods.linear_positioning.settings import LIMITS
 from errormotion.methods.linear_positioning.settings import Settings as PositioningSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
@@ -13,17 +16,20 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
+    from errormotion.estimation.datum import Relative
+    from errormotion.estimation.fit import Fit
     from errormotion.kinematics.description import MachineDescription
+    from errormotion.measurement import Observed
 
 
-class LinearPositioning:
+class LinearPositioning(ModelMethod):
     """Errors of one linear axis at target positions, approached repeatedly from both directions (ISO 230-2)."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="linear_positioning",
         summary="Positioning accuracy and repeatability of a linear axis after ISO 230-2; its straightness and angles",
         status="simulated_only",
-        version="3",
+        version="4",
         cannot_see=(
             "freedoms that were not measured",
             "errors between the targets that vary over less than the interval of the targets",
@@ -35,10 +41,8 @@ class LinearPositioning:
     needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = PositioningSettings
     raw_schemas = lazy("errormotion.methods.linear_positioning.schema:RAW_SCHEMAS")
-    simulate = lazy("errormotion.methods.linear_positioning.simulation:simulate")
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
     texts = lazy("errormotion.methods.linear_positioning.report:texts")
-    redrawing = lazy("errormotion.methods.linear_positioning.redrawing:redrawing")
     conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
     log_readers = lazy("errormotion.methods.linear_positioning.rtl:LOG_READERS")
     figures = lazy("errormotion.methods.linear_positioning.figures:figures")
@@ -152,8 +156,30 @@ class LinearPositioning:
             return float(sum(1 for _ in moving.cycles(settings)))
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
+    def observe(self, raw: xr.Dataset, settings: PositioningSettings) -> Observed:
+        """Return what raw data mean: `errormotion.methods.linear_positioning.model`, or `identification.moving`."""
+        its = _evaluation(raw)
+        observed: Observed = its.observe(raw, its.evaluate(raw, settings), settings)
+        return observed
+
+    def expected(self, settings: PositioningSettings) -> xr.Dataset:
+        """Return the readings of a test without noise, of an axis of the virtual machine."""
+        from errormotion.methods.linear_positioning import simulation
+
+        return simulation.expected(settings)
+
+    def results(self, observed: Observed, fit: Fit, relative: Relative) -> Mapping[str, xr.DataArray]:  # noqa: ARG002
+        """Return the squareness that diagonals determine."""
+        if observed.sensitivity is None:
+            return {}
+        from errormotion.methods.linear_positioning.diagonals.identification import squareness
+
+        return squareness(observed, relative)
+
     def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return the error dataset of an axis over ``position``, or of diagonals over their stops.
+
+        The model states the errors; the figures of the standard are added, which no trial and no plan needs.
 
         Parameters
         ----------
@@ -168,23 +194,50 @@ class LinearPositioning:
         MethodError
             The data do not determine the result.
         """
+        from errormotion.datasets import provenance
         from errormotion.datasets.validation import checked_raw
-        from errormotion.methods.linear_positioning.diagonals.identification import identify_diagonals
-        from errormotion.methods.linear_positioning.identification.identify import identify
-        from errormotion.methods.linear_positioning.identification.moving import identify_moving
+        from errormotion.measurement.identification import dataset, solve
 
-        checked = checked_raw(raw, self)
         settings = settings or PositioningSettings()
-        if "diagonal" in checked.dims:
-            return identify_diagonals(checked, settings, self.info)
-        found = (identify_moving if "cycle" in checked.dims else identify)(checked, settings, self.info)
+        checked = checked_raw(raw, self)
+        its = _evaluation(checked)
+        evaluated = its.evaluate(checked, settings)
+        solved = solve(its.observe(checked, evaluated, settings))
+        more = dict(solved.observed.extras) | its.extras(evaluated, solved, settings)
+        solved = replace(solved, observed=replace(solved.observed, extras=more))
+        origin = provenance.make(settings, checked, None, steps=evaluated.steps)
+        limits = {name: limit for name in LIMITS.values() if (limit := getattr(settings, name)) is not None}
+        found = dataset(self, solved, checked, self.info, origin)
+        if "cycle" not in checked.dims:
+            found = found.assign_attrs(limits)
         place = settings.straightness_reference
-        return found.assign_attrs({"straightness_reference": place} | found.attrs) if place else found
+        if not place or "diagonal" in checked.dims:
+            return found
+        return found.assign_attrs({"straightness_reference": place} | found.attrs)
+
+    def simulate(self, settings: PositioningSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+        """Return raw data with every source of the model drawn once, and the true errors.
+
+        They do not state the scatter, which a test estimates, unless it has too few runs.
+        """
+        from errormotion.methods.linear_positioning.identification.scatter import MIN_RUNS
+
+        raw, true = super().simulate(settings, seed)
+        few = settings.moving is None and settings.runs < MIN_RUNS
+        return (raw if few else raw.drop_vars(["reading_scatter", "run_drift"], errors="ignore")), true
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""
-        from errormotion.methods.linear_positioning.diagonals.plan import plan_diagonals
-        from errormotion.methods.linear_positioning.planning.plan import plan
+        from errormotion.methods.linear_positioning.planning.plan import summary
 
         settings = settings or PositioningSettings()
-        return plan(settings, self.info) if settings.diagonals is None else plan_diagonals(settings, self.info)
+        planned = super().plan(settings)
+        return planned.assign_attrs(notes=[*planned.em.notes, summary(planned, settings)])
+
+
+def _evaluation(raw: xr.Dataset) -> Any:
+    """Return the module that evaluates an axis, a moving axis, or diagonals."""
+    from errormotion.methods.linear_positioning.diagonals import identification as diagonals
+    from errormotion.methods.linear_positioning.identification import identify, moving
+
+    return diagonals if "diagonal" in raw.dims else moving if "cycle" in raw.dims else identify

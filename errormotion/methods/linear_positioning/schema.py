@@ -39,6 +39,23 @@ _ALIGNMENT = Row(
     required=False,
 )
 
+_SCATTER = "standard deviation of a reading; a smaller estimate is replaced by it. NaN = not stated"
+_DRIFT = (
+    "range of the readings at rest during one run; a smaller estimate of the drift from run to run is replaced by it. "
+    "NaN = not stated"
+)
+
+
+def _scatter(dim: str) -> Row:
+    unit, units = ("m", ()) if dim == "diagonal" else ("", ("m", "rad"))
+    return Row("reading_scatter", (dim,), unit, 0.0, 1e-3, _SCATTER, required=False, missing=True, units=units)
+
+
+def _drift(dim: str) -> Row:
+    unit, units = ("m", ()) if dim == "diagonal" else ("", ("m", "rad"))
+    return Row("run_drift", (dim,), unit, 0.0, 1e-3, _DRIFT, required=False, missing=True, units=units)
+
+
 RAW_SCHEMAS = (
     RawSchema(
         SCHEMA,
@@ -131,6 +148,8 @@ RAW_SCHEMAS = (
                 required=False,
             ),
             _ALIGNMENT,
+            _scatter("freedom"),
+            _drift("freedom"),
         ),
         sizes=DIRECTION,
         labels=XYZ,
@@ -162,6 +181,7 @@ RAW_SCHEMAS = (
             Row("moving", ("cycle",), "1", 0.0, 1.0, "1 while the axis was moving before the reading, 0 at rest"),
             _POINT,
             _LENGTH,
+            _scatter("freedom"),
             Row("temperature", ("cycle", "sensor"), "degC", -40.0, 100.0, "of each sensor; NaN = none", required=False),
         ),
         sizes={**DIRECTION, "end": 2},
@@ -192,6 +212,8 @@ RAW_SCHEMAS = (
             _POINT,
             _LENGTH,
             _ALIGNMENT,
+            _scatter("diagonal"),
+            _drift("diagonal"),
         ),
         sizes=DIRECTION,
         labels=XYZ,

@@ -64,7 +64,9 @@ class Budget(PluginSettings):
         "run to run; required with fewer than four runs",
     )
     scatter: Length | None = Field(
-        default=None, gt=0, description="standard deviation of a reading; required with a single run"
+        default=None,
+        gt=0,
+        description="standard deviation of a reading: lower bound of its estimate; required with a single run",
     )
 
     @property
@@ -232,7 +234,3 @@ class Settings(PluginSettings):
         if self.settle > self.dwell:
             raise ValueError(f"settle: expected at most the dwell, {self.dwell:g} s; found {self.settle:g} s")
         return self
-
-
-class TrialSettings(Settings):
-    """Settings of one trial of the Monte Carlo method, without statistics and figures, which trials do not use."""

@@ -1,4 +1,4 @@
-"""Simulated raw data of a moving axis with known errors: its screw expands in motion and contracts at rest."""
+"""Readings that a test of a moving axis is expected to give: its screw expands in motion and contracts at rest."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
 from errormotion.methods.linear_positioning.moving import cycles, ends, moving_of
 from errormotion.methods.linear_positioning.schema import SCHEMA
-from errormotion.methods.linear_positioning.virtual import MACHINE, instruments_of
-from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
@@ -21,15 +19,12 @@ GROWTH, SHIFT = 30e-6, 8e-6
 """Final relative expansion of the screw, 1, and displacement of its bearing, m (rad for rotations)."""
 TIME_CONSTANT = 2400.0
 """Of the warm-up of the screw, s."""
-NOISE = 0.3e-6
-"""Standard deviation of a reading; m, rad."""
 COLD_INTERVAL = 30.0
 """Interval of the cold readings, s."""
 
 
-def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return readings at both ends of the stroke, and the true changes since the cold state."""
-    generator = np.random.default_rng(seed)
+def expected_moving(settings: Settings, scatter: float) -> xr.Dataset:
+    """Return readings at both ends of the stroke without noise, with the standard deviation ``scatter``, m or rad."""
     plan = list(cycles(settings))
     cold = sum(cycle.cold for cycle in plan)
     interval = moving_of(settings).interval
@@ -37,37 +32,21 @@ def simulate_moving(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Datas
         [COLD_INTERVAL * (i + 1 - cold) if i < cold else interval * (i + 1 - cold) for i in range(len(plan))]
     )
     moving = np.array([cycle.moving for cycle in plan])
-    warmth = _warmth(time, moving)
     P, along = np.array(ends(settings)), direction_of(settings.axis)
-    columns = [DOF.index(name) for name in settings.freedoms]
-    size = 1.0 + 0.3 * generator.normal(size=len(columns))
-    shape = np.array([GROWTH * (P - P[0]) * (k == along) + SHIFT for k in columns])
-    change = size[:, None, None] * warmth[None, :, None] * shape[:, None, :]  # (freedom, cycle, end)
-    scale = (
-        settings.uncertainty.length_or_assumed * generator.normal()
-    )  # change of the instrument's scale since the cold state
-    read = change + NOISE * generator.normal(size=change.shape)
-    if along in columns:
-        read[columns.index(along), cold:] += scale * (P - P[0])
-    names = iso_names(settings.axis)
+    shape = np.array([GROWTH * (P - P[0]) * (name == DOF[along]) + SHIFT for name in settings.freedoms])
+    metre = {"units": "m"}
     variables: dict[str, Any] = {
-        "end_deviation": (("freedom", "cycle", "end"), read),
-        "end_position": ("end", P, {"units": "m"}),
+        "end_deviation": (("freedom", "cycle", "end"), _warmth(time, moving)[None, :, None] * shape[:, None, :]),
+        "end_position": ("end", P, metre),
         "reading_time": ("cycle", time, {"units": "s"}),
         "moving": ("cycle", moving.astype(float), {"units": "1"}),
-        "functional_point": ("direction", np.zeros(3), {"units": "m"}),
+        "functional_point": ("direction", np.zeros(3), metre),
         "length_uncertainty": ((), settings.uncertainty.length_or_assumed, {"units": "1"}),
+        "reading_scatter": ("freedom", np.full(len(shape), scatter)),
     }
+    names = iso_names(settings.axis)
     coords = {"freedom": [names[name] for name in settings.freedoms], "direction": list("xyz")}
-    machine = VirtualMachine(MACHINE, seed=seed)
-    attrs = {"schema": SCHEMA, "axis": settings.axis, "machine": machine.name, "instruments": instruments_of(machine)}
-    twist = np.full((time.size - cold + 1, 2, 6), np.nan)
-    for values, k in zip(change, columns, strict=True):
-        twist[..., k] = np.concatenate([np.zeros((1, 2)), values[cold:]])
-    origin = truth.Origin(machine.name, machine.kind, machine.seed, machine.state.schedule.events)
-    at = {"time": np.append(0.0, time[cold:]), "xyz"[along]: ("position", P, {"units": "m"})}
-    true = truth.dataset(twist, ("time", "position"), at, settings.axis, np.zeros(3), "cold state", origin)
-    return xr.Dataset(variables, coords, attrs), true
+    return xr.Dataset(variables, coords, {"schema": SCHEMA, "axis": settings.axis})
 
 
 def _warmth(time: Array, moving: Array) -> Array:

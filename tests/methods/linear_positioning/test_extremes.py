@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from errormotion.measurement.identification import solve
 from errormotion.methods.linear_positioning import Settings
-from errormotion.methods.linear_positioning.identification import extremes, standard
-from errormotion.methods.linear_positioning.identification.identify import evaluate
+from errormotion.methods.linear_positioning.identification import standard
+from errormotion.methods.linear_positioning.identification.identify import evaluate, figures_of, observe
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, Statistics
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
@@ -33,9 +34,8 @@ def compared(name):
     found = []
     for seed in range(SEEDS):
         raw, truth = raw_and_truth(SETTINGS, seed, BEHAVIOURS[name])
-        seen = evaluate(raw, SETTINGS, [])
-        shared = np.array([source.effect[0] for source in seen.systematic])
-        of = extremes.figures(seen.readings.x[0], seen.spreads[0], shared, 0.0, straight=False, trials=SETTINGS.trials)
+        seen = evaluate(raw, SETTINGS)
+        (of,) = figures_of(seen, solve(observe(raw, seen, SETTINGS)), SETTINGS.trials)
         found.append((of.value - true_figures(truth, BEHAVIOURS[name]), of.bias, of.u))
     return np.array(found).transpose(1, 0, 2)
 

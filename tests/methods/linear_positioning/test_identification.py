@@ -2,12 +2,19 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from errormotion.datasets.results.merit import figures_of
 from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning.identification import scatter
 
 P = np.linspace(0.0, 1.0, 11)
+
+
+def scattered(x, kind="auto", drift=None, stated=None):
+    """Return the variances of readings (approach, run, target), and the scaled positions."""
+    z = np.linspace(-1.0, 1.0, x.shape[-1])
+    return scatter.scatter(x, z, kind=kind, drift=drift, stated=stated), z
 
 
 def noisy(seed=0, freedoms=1, runs=5, size=1e-6):
@@ -34,12 +41,10 @@ def test_covariance_of_the_means_is_the_cramer_rao_bound_of_the_model(raw_of, id
     """If no reading is missing, the mean is the weighted least-squares estimate of the model of the scatter."""
     readings = noisy() + 1e-6 * np.random.default_rng(1).normal(size=(1, 5, 1, 1))
     errors = identify(raw_of(readings, P))
-    found = scatter.scatter(readings[0].transpose(1, 0, 2), P, kind="auto", drift=None, stated=None)
-    z = found.z
+    found, z = scattered(readings[0].transpose(1, 0, 2))
     # variances as the method states them, with their Student factors
-    own = found.own_factor * float(found.own[0, 0])
-    D = found.common_mean[0] + found.common_mean[1] * np.outer(z, z)
-    H = found.opposite_mean[0] + found.opposite_mean[1] * np.outer(z, z)
+    own, (o, q, p, w) = float(found.own_stated[0, 0]), found.run_stated
+    D, H = o + q * np.outer(z, z), p + w * np.outer(z, z)
     V = np.block([[D + H, D - H], [D - H, D + H]]) + own * np.eye(2 * P.size)  # of one run, forward then backward
     information = 5 * np.linalg.inv(V)
     mean = np.hstack([np.eye(P.size), np.eye(P.size)]) / 2.0
@@ -170,21 +175,87 @@ def test_variances_that_differ_from_target_to_target_are_found(raw_of, identify)
 def test_drift_from_run_to_run_is_shared_by_the_targets(raw_of, identify):
     drift = 3e-6 * np.random.default_rng(2).normal(size=(1, 5, 1, 1))
     errors = identify(raw_of(noisy(size=0.1e-6) + drift, P))
-    expected = np.sqrt(drift.var(ddof=1) / 5 * 2)  # Student factor of 4 degrees of freedom: 4 / (4 - 2)
+    student = stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)  # four degrees of freedom
+    expected = np.sqrt(drift.var(ddof=1) / 5) * student
     u = errors.em.budget().sel(group="drift from run to run", dof="EX").values
     assert u[5] == pytest.approx(expected, rel=0.05)
     assert np.sqrt(errors.em.covariance_between(0, 10).values[0, 0]) == pytest.approx(expected, rel=0.1)
 
 
 def test_unequal_scatter_at_too_few_targets_is_stated_at_least_as_the_common_one():
-    """Four targets and five runs leave too few degrees of freedom for a variance of each target."""
-    position = np.array([0.0, 0.1, 0.25, 0.5])
-    readings = np.random.default_rng(3).standard_normal((2, 5, 4)) * 1e-6
+    """Three runs leave two degrees of freedom at most for a variance of each target."""
+    readings = np.random.default_rng(3).standard_normal((2, 3, 8)) * 1e-6
     readings[1] *= 1e-3  # the scatter of one approach
-    found = scatter.scatter(readings, position, kind="auto", drift=None, stated=None)
-    pooled = scatter.scatter(readings, position, kind="pooled", drift=None, stated=None)
+    found, _ = scattered(readings, drift=1e-6)
+    pooled, _ = scattered(readings, "pooled", drift=1e-6)
     assert found.unequal
     assert not pooled.unequal
-    assert (found.own >= pooled.own).all()
-    with pytest.raises(MethodError, match=r"expected \d+ runs or more at these targets; found 5"):
-        scatter.scatter(readings, position, kind="target", drift=None, stated=None)
+    assert (found.own >= pooled.own * (1 - 1e-9)).all()
+    with pytest.raises(MethodError, match=r"expected \d+ runs or more at these targets; found 3"):
+        scattered(readings, "target", drift=1e-6)
+
+
+def test_variances_are_those_of_an_analysis_of_variance_if_none_is_negative():
+    """Mean squares of lines through complete data, with the variance of the readings subtracted."""
+    draw = np.random.default_rng(5).standard_normal
+    runs, z = 30, np.linspace(-1.0, 1.0, 9)
+    effects = np.array([3.0, 2.0, 1.5, 1.0])[:, None] * draw((4, runs))
+    common, opposite = (effects[k][:, None] + effects[k + 1][:, None] * z for k in (0, 2))
+    x = 1e-6 * (np.stack([common + opposite, common - opposite]) + 0.8 * draw((2, runs, 9)))
+    found, _ = scattered(x)
+    Z = np.stack([np.ones(9), z], axis=1)
+    lines = (x - x.mean(axis=1, keepdims=True)) @ np.linalg.pinv(Z).T  # (approach, run, 2)
+    rest = x - x.mean(axis=1, keepdims=True) - lines @ Z.T
+    own = (rest**2).sum() / (2 * (runs - 1) * (9 - 2))
+    noise = np.diagonal(np.linalg.inv(Z.T @ Z)) * own / 2
+    half = np.concatenate([(lines[0] + lines[1]) / 2, (lines[0] - lines[1]) / 2], axis=1)
+    of_run = half.var(axis=0, ddof=1)
+    np.testing.assert_allclose(found.own, own, rtol=1e-5)
+    np.testing.assert_allclose(found.noise, np.tile(noise, 2), rtol=1e-5)
+    np.testing.assert_allclose(found.run, of_run - np.tile(noise, 2), rtol=1e-4)
+    np.testing.assert_allclose(found.freedom, runs - 1, rtol=1e-4)
+
+
+@pytest.mark.parametrize("runs", [4, 5, 8])
+def test_intervals_of_two_standard_uncertainties_contain_the_mean_with_few_runs(raw_of, identify, runs):
+    """95 % of the means of a drifting axis are within 2 u, whatever the number of runs."""
+    seeds, held = 200, []
+    for seed in range(seeds):
+        drift = 2e-6 * np.random.default_rng(seed + 1000).normal(size=(1, runs, 1, 1))
+        errors = identify(raw_of(noisy(seed, runs=runs, size=0.2e-6) + drift, P))
+        held.append(np.abs(errors["EX"][5]) <= 2.0 * np.sqrt(errors["covariance"][5, 0, 0]))
+    assert stats.binom.ppf(1e-3, seeds, 0.95) <= np.sum(held) <= stats.binom.ppf(1 - 1e-3, seeds, 0.97)
+
+
+def test_drift_above_the_stated_one_enlarges_the_uncertainty_of_few_runs(raw_of, identify):
+    drift = np.array([-3e-6, 0.0, 3e-6])[None, :, None, None]
+    stated = {"length": 0.0, "alignment": 0.0, "drift": 0.5e-6}
+    errors = identify(raw_of(noisy(runs=3, size=0.1e-6) + drift, P), uncertainty=stated)
+    u = errors.em.budget().sel(group="drift from run to run", dof="EX").values
+    assert u[5] == pytest.approx(3e-6 / np.sqrt(3), rel=0.05)
+
+
+@pytest.mark.parametrize("by", ["data", "settings"])
+def test_a_stated_scatter_is_a_lower_bound(raw_of, identify, by):
+    raw, stated = raw_of(noisy(size=0.1e-6), P), {"length": 0.0, "alignment": 0.0}
+    if by == "data":
+        raw = raw.assign(reading_scatter=("freedom", [2e-6]), run_drift=("freedom", [np.sqrt(12.0) * 1e-6]))
+    else:
+        stated |= {"scatter": 2e-6, "drift": np.sqrt(12.0) * 1e-6}
+    budget = identify(raw, uncertainty=stated).em.budget().sel(dof="EX").isel(position=5)
+    assert float(budget.sel(group="independent")) == pytest.approx(2e-6 / np.sqrt(10))
+    assert float(budget.sel(group="drift from run to run")) == pytest.approx(1e-6 / np.sqrt(2 * 5), rel=1e-3)
+
+
+def test_missing_readings_of_a_drifting_axis_do_not_displace_a_target(raw_of, identify):
+    """A target that lacks the readings of some runs is where it would be with them: other targets show their drift."""
+    drift = 5e-6 * np.arange(-2, 3)[None, :, None, None]
+    readings = noisy(size=0.05e-6) + drift
+    full = identify(raw_of(readings, P))
+    readings[0, 3:, :, 4] = np.nan
+    errors = identify(raw_of(readings, P))
+    assert float(abs(errors["EX"][4] - full["EX"][4])) < 0.2e-6  # the mean of three runs is 5 um less
+    u = np.sqrt(errors["covariance"].values[:, 0, 0])
+    assert u[4] == pytest.approx(u[5], rel=0.01)
+    between = errors.em.covariance_between(4, 5).values[0, 0] / (u[4] * u[5])
+    assert between > 0.99

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.description import MachineDescription
@@ -84,8 +85,9 @@ def test_the_plan_states_the_uncertainty_of_a_simulated_test():
     for seed in range(20):
         errors = METHOD.identify(raw_and_truth(free, seed, behaviour)[0], free)
         measured.append(errors.em.budget().sel(group=groups, dof="EX").isel(position=5).values ** 2)
-    # a variance with 11 degrees of freedom is known to 43 %, its mean over 20 tests to 10 %; Student's factor is 11/9
-    assert np.sqrt(np.mean(measured, axis=0)) == pytest.approx(planned, rel=0.2)
+    # a variance with 11 degrees of freedom is known to 43 %, its mean over 20 tests to 10 %
+    student = np.array([stats.t.ppf(0.975, 11) / stats.norm.ppf(0.975), 1.0])
+    assert np.sqrt(np.mean(measured, axis=0)) == pytest.approx(planned * student, rel=0.2)
 
 
 def test_duplicate_targets_are_refused():

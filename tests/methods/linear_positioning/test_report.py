@@ -8,7 +8,6 @@ import pytest
 from errormotion.datasets.results.merit import figures_of
 from errormotion.methods.linear_positioning import LinearPositioning, Settings
 from errormotion.methods.linear_positioning.report import chapters
-from errormotion.methods.linear_positioning.simulation import simulate
 from errormotion.report.document import Figure, Source, Table
 
 SETTINGS = Settings(freedoms=("EY", "EX", "EB"), trials=200, accuracy_limit=1e-3, repeatability_limit=1e-9)
@@ -16,7 +15,7 @@ SETTINGS = Settings(freedoms=("EY", "EX", "EB"), trials=200, accuracy_limit=1e-3
 
 @pytest.fixture(scope="module")
 def errors():
-    return LinearPositioning().identify(simulate(SETTINGS, 3)[0], SETTINGS)
+    return LinearPositioning().identify(LinearPositioning().simulate(SETTINGS, 3)[0], SETTINGS)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ the axis at the distance ``l`` from the zero of the instrument is therefore too 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,58 +16,57 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning.identification.reading import Readings
-from errormotion.methods.linear_positioning.settings import Budget, Settings, Side
+from errormotion.methods.linear_positioning.settings import Budget, Settings
+from errormotion.methods.linear_positioning.settings import Side as Stated
 
 SIDES = {"machine": 1.0, "workpiece": -1.0}
 """Sides, and the sign with which they enter a deviation."""
 
 
-@dataclass(frozen=True)
-class Shared:
-    """A source whose error is the same in the whole test, with the effect of its standard uncertainty.
+@dataclass(frozen=True, eq=False)
+class Side:
+    """What expands: the positioning system of the machine, or the artefact that embodies the lengths.
 
     Attributes
     ----------
-    name, group : str
-    effect : ndarray, (freedom, target)
-        On the deviations, m or rad.
+    name : str
+    sign : float
+        With which it enters a deviation.
+    coefficient, coefficient_u : float
+        Of expansion, and its standard uncertainty, 1/K.
+    excess : ndarray, (approach, run, target)
+        Temperature above the reference, K.
+    temperature_u : float
+        Standard uncertainty that all temperatures share, K.
     """
 
     name: str
-    group: str
-    effect: Array
+    sign: float
+    coefficient: float
+    coefficient_u: float
+    excess: Array
+    temperature_u: float
 
 
-@dataclass(frozen=True)
-class Correction:
-    """Effect of expansion on the readings along the axis, (approach, run, target), m, and its sources.
+def sides_of(
+    raw: xr.Dataset, temperature: Mapping[str, Array], shape: tuple[int, ...], settings: Settings, notes: list[str]
+) -> list[Side]:
+    """Return the sides whose expansion data or settings state; remarks are appended to ``notes``.
 
-    ``complete`` states whether the expansion of the machine is known, so that the result applies to the reference
-    temperature.
-    """
-
-    along: Array
-    sources: list[Shared]
-    complete: bool
-
-
-def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: list[str]) -> Correction:
-    """Return the correction for the temperatures that data or settings state; remarks are appended to ``notes``.
+    ``temperature`` contains (approach, run, target) for each sensor, of which ``shape`` is the shape.
 
     Raises
     ------
     MethodError
         A coefficient without a temperature, or a temperature without a coefficient.
     """
-    shape = readings.x.shape[1:]
-    total, sources, complete = np.zeros(shape), list[Shared](), False
-    u_T = _scalar(raw, "temperature_uncertainty", settings.uncertainty.temperature)
+    found = []
+    u_T = _scalar(raw, "temperature_uncertainty", settings.uncertainty.temperature) or 0.0
     for name, sign in SIDES.items():
-        side: Side = getattr(settings, name)
+        side: Stated = getattr(settings, name)
         alpha = _scalar(raw, f"{name}_expansion", side.expansion)
         u_alpha = _scalar(raw, f"{name}_expansion_uncertainty", side.expansion_uncertainty) or 0.0
-        excess = _excess(readings, name, side, settings.reference_temperature)
+        excess = _excess(temperature, shape, name, side, settings.reference_temperature)
         if alpha is None and excess is None:
             continue
         if not (alpha or u_alpha) and excess is None:  # no expansion on this side
@@ -79,29 +79,18 @@ def expansion(raw: xr.Dataset, readings: Readings, settings: Settings, notes: li
                 f"{name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}."
             )
         notes += _assumptions(raw, name, side, settings)
-        total += sign * alpha * excess * readings.lever
-        complete |= name == "machine"
-        mean = excess.mean(axis=(0, 1))
-        changes = {
-            f"coefficient of expansion, {name}": u_alpha * mean * readings.lever,
-            f"temperature, {name}": (u_T or 0.0) * alpha * readings.lever,
-        }
-        sources += [
-            Shared(title, "expansion", _along(readings, sign * change))
-            for title, change in changes.items()
-            if np.abs(change).max() > 0
-        ]
-    if not complete:
+        found.append(Side(name, sign, alpha, u_alpha, excess, u_T))
+    if not any(side.name == "machine" for side in found):
         notes.append(
             "The temperature of the positioning system is not stated: the errors apply to the temperature of the test."
         )
-    return Correction(total, sources, complete)
+    return found
 
 
-def _assumptions(raw: xr.Dataset, name: str, side: Side, settings: Settings) -> list[str]:
+def _assumptions(raw: xr.Dataset, name: str, side: Stated, settings: Settings) -> list[str]:
     """Return a note on each uncertainty of a side that has the default of its setting."""
     notes = []
-    if f"{name}_expansion_uncertainty" not in raw and side.expansion_uncertainty == Side().expansion_uncertainty:
+    if f"{name}_expansion_uncertainty" not in raw and side.expansion_uncertainty == Stated().expansion_uncertainty:
         notes.append(
             f"Assumed: a standard uncertainty of the coefficient of expansion of the {name} of "
             f"{1e6 * side.expansion_uncertainty:g} um/m/K ({name}.expansion_uncertainty)."
@@ -114,13 +103,6 @@ def _assumptions(raw: xr.Dataset, name: str, side: Side, settings: Settings) -> 
     return notes
 
 
-def _along(readings: Readings, change: Array) -> Array:
-    effect = np.zeros((len(readings.freedoms), readings.position.size))
-    if readings.along in readings.freedoms:
-        effect[readings.freedoms.index(readings.along)] = change
-    return effect
-
-
 def _scalar(raw: xr.Dataset, name: str, default: float | None) -> float | None:
     if name not in raw:
         return default
@@ -130,20 +112,18 @@ def _scalar(raw: xr.Dataset, name: str, default: float | None) -> float | None:
     return value
 
 
-def _excess(readings: Readings, name: str, side: Side, reference: float) -> Array | None:
+def _excess(
+    temperature: Mapping[str, Array], shape: tuple[int, ...], name: str, side: Stated, reference: float
+) -> Array | None:
     """Return the temperature of a side above the reference at each reading, K; None if it is not stated."""
-    shape = readings.x.shape[1:]
-    if not side.sensors and name in readings.temperature:
-        names: tuple[str, ...] = (name,)
-    else:
-        names = side.sensors
-    if missing := [sensor for sensor in names if sensor not in readings.temperature]:
-        known = ", ".join(readings.temperature) or "none"
+    names = side.sensors or ((name,) if name in temperature else ())
+    if missing := [sensor for sensor in names if sensor not in temperature]:
+        known = ", ".join(temperature) or "none"
         raise MethodError(f"{name}.sensors: expected names of {known}; found {', '.join(missing)}")
     if names:
-        mean = np.stack([_filled(readings.temperature[sensor], sensor) for sensor in names]).mean(axis=0)
+        mean = np.stack([_filled(temperature[sensor], sensor) for sensor in names]).mean(axis=0)
         return np.asarray(mean - reference)
-    return None if side.temperature is None else np.full(shape, side.temperature - reference)
+    return None if side.temperature is None else np.full((2, *shape[1:]), side.temperature - reference)
 
 
 def _filled(temperature: Array, sensor: str) -> Array:

@@ -43,13 +43,17 @@ def _measured_approach(mean: Array) -> Array:
     return np.asarray(np.where(np.isfinite(mean[..., 0, :]), mean[..., 0, :], mean[..., 1, :]))
 
 
-def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straight: bool, trials: int) -> Extremes:
+def figures(
+    x: Array, z: Array, spread: Scatter, shared: Array, target_u: float, *, straight: bool, trials: int
+) -> Extremes:
     """Return the figures of readings in the order of ``standard.FIGURES`` with their bias and uncertainty; m or rad.
 
     Parameters
     ----------
     x : ndarray, (approach, run, target)
         Corrected deviations.
+    z : ndarray, (target,)
+        Position, scaled to -1 ... 1.
     spread : Scatter
     shared : ndarray, (source, target)
         Effect of one standard uncertainty of each source that approaches and runs share, without drift.
@@ -61,26 +65,27 @@ def figures(x: Array, spread: Scatter, shared: Array, target_u: float, *, straig
         0: bias and uncertainty are not determined (NaN).
     """
     observed = standard.statistics(x)
-    value = _evaluate(observed, spread.z, straight)
+    value = _evaluate(observed, z, straight)
     if not trials:
         return Extremes(value, *np.full((2, value.size), np.nan))
-    found = by_true_values(value, _evaluate(_trials(x, observed, spread, shared, target_u, trials), spread.z, straight))
+    true = _trials(x, z, observed, spread, shared, target_u, trials)
+    found = by_true_values(value, _evaluate(true, z, straight))
     mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
     if not np.isfinite(value[mean]):
         return found
     others = np.arange(value.size) != mean
     return replace(
-        found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, _mean_reversal_u(x, spread))
+        found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, _mean_reversal_u(x, z, spread))
     )
 
 
-def _mean_reversal_u(x: Array, spread: Scatter) -> float:
+def _mean_reversal_u(x: Array, z: Array, spread: Scatter) -> float:
     n = np.isfinite(x).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        own = (spread.own_factor * spread.own / n).sum(axis=0)
+        own = (spread.own_stated / n).sum(axis=0)
     known = np.isfinite(own)
-    inclined = spread.z[known].mean() ** 2  # 0 if no target is missing
-    drift = 4.0 * (spread.opposite_mean[0] + spread.opposite_mean[1] * inclined) / n.max()
+    inclined = z[known].mean() ** 2  # 0 if no target is missing
+    drift = 4.0 * (spread.run_stated[2] + spread.run_stated[3] * inclined) / n.max()
     return float(np.sqrt(own[known].sum() / known.sum() ** 2 + drift))
 
 
@@ -88,19 +93,22 @@ def _evaluate(statistics: Statistics, z: Array, straight: bool) -> Array:
     return standard.figures(straightened(statistics, z) if straight else statistics)
 
 
-def _trials(x: Array, observed: Statistics, spread: Scatter, shared: Array, target_u: float, trials: int) -> Statistics:
+def _trials(
+    x: Array, z: Array, observed: Statistics, spread: Scatter, shared: Array, target_u: float, trials: int
+) -> Statistics:
     """Return draws of the true means and standard deviations, (trial, approach, target)."""
     generator = np.random.default_rng(SEED)
     draw = generator.standard_normal
-    z, m = spread.z, spread.z.size
+    m = z.size
     n = np.isfinite(x).sum(axis=1)
     measured = n.any(axis=1)
     both = bool(measured.all())
-    freedom = 2.0 * spread.own_factor / (spread.own_factor - 1.0) if spread.own_factor > 1.0 else np.inf
-    own = draw_variances(spread.own, freedom, trials, generator, common=spread.pooled)  # (trial, approach, target)
+    own = draw_variances(
+        spread.own, spread.own_freedom, trials, generator, common=spread.pooled
+    )  # (trial, approach, target)
     common, opposite = (
-        draw_components(variance, spread.noise, spread.freedom, trials, generator)  # (trial, 2)
-        for variance in (spread.common, spread.opposite)
+        draw_components(spread.run[two], spread.noise[two], spread.freedom[two], trials, generator)  # (trial, 2)
+        for two in (slice(2), slice(2, 4))
     )
     with np.errstate(invalid="ignore", divide="ignore"):
         of_mean = own / n

@@ -1,39 +1,43 @@
 """Thermal distortion by a moving axis (ISO 230-3): errors at both ends of the stroke over time, and their ranges.
 
-The errors are the deviations minus their mean in the cold state. The noise of a reading follows from second differences
-over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the machine vanishes. Ranges are those of
-single readings, and of the value after exactly 60 min, between two readings: a mean over cycles lags behind the drift.
-A range of noisy readings is too large; its mean excess is stated as bias, and is contained in its uncertainty
-(`errormotion.estimation.extremes`).
+A reading y at an end with the distance l from the lower one is ``y + s l = m + e``: m is its mean in the cold state and
+e the error since then, 0 in the cold state; s is the change of the instrument's scale since then. The noise of a
+reading follows from second differences over time, ``var(x_1 - 2 x_2 + x_3) = 6 s^2``, in which a smooth drift of the
+machine vanishes. Ranges are those of single readings, and of the value after exactly 60 min, between two readings: a
+mean over cycles lags behind the drift. A range of noisy readings is too large; its mean excess is stated as bias, and
+is contained in its uncertainty (`errormotion.estimation.extremes`).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.certificates import certified
-from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
 from errormotion.estimation.extremes import expanded, range_from_reference
 from errormotion.kinematics.iso import DOF, direction_of, iso_names
-from errormotion.methods.linear_positioning.identification.budget import assumed_length
+from errormotion.measurement import Block, Constant, Noise, Observed, Places, Problem
 from errormotion.methods.linear_positioning.identification.reading import (
+    assumed_length,
     axis_of,
     freedoms_of,
     length_uncertainty,
     point_of,
 )
+from errormotion.methods.linear_positioning.identification.scatter import EQUAL
 from errormotion.methods.linear_positioning.settings import Settings
 
 if TYPE_CHECKING:
-    from errormotion.plugins import MethodInfo
+    from errormotion.measurement.observed import Solved
+
+T = TypeVar("T")
 
 QUANTITIES = ("P1", "P2", "P2 - P1")
 """The two ends, in the order of their positions, and the change of the length between them."""
@@ -46,10 +50,79 @@ MIN_CYCLES = 6
 COLD, LENGTH = "cold reference", "scale of the lengths"
 
 
-def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, stated: float | None = None) -> xr.Dataset:
-    """Return the errors of the axis at both ends over ``time`` and ``position``, relative to the cold state.
+class Unknowns(NamedTuple, Generic[T]):
+    """Errors of each time at each end, and the mean of each end in the cold state; columns are freedoms."""
 
-    ``stated`` is the standard deviation of a reading, m or rad, for a plan; by default it is estimated.
+    error: T
+    cold: T
+
+
+class Known(NamedTuple, Generic[T]):
+    """The scale of the instrument since the cold state."""
+
+    length: T
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Readings of a moving axis.
+
+    Attributes
+    ----------
+    axis : str
+    freedoms : tuple of str
+    time : ndarray, (cycle,)
+        Since the axis started to move, s; 0 or less in the cold state.
+    moving : ndarray, (cycle,)
+    position : ndarray, (end,)
+        In their order, m.
+    x : ndarray, (cycle, end, freedom)
+        m or rad, with the ends in their order.
+    order : ndarray of int, (end,)
+        The recorded ends in their order.
+    noise : ndarray, (freedom,)
+        Standard deviation of a reading, m or rad.
+    length : float
+        Relative standard uncertainty of lengths.
+    """
+
+    axis: str
+    freedoms: tuple[str, ...]
+    time: Array
+    moving: Array
+    position: Array
+    x: Array
+    order: NDArray[np.intp]
+    noise: Array
+    length: float
+    notes: list[str]
+
+    steps = ("less the mean of the cold state",)
+
+    @property
+    def cold(self) -> NDArray[np.bool_]:
+        """Which cycles are in the cold state."""
+        return np.asarray(self.time <= 0.0)
+
+    @property
+    def t(self) -> Array:
+        """Times of the result, s: the cold state, and the cycles after it."""
+        return np.concatenate([[0.0], self.time[~self.cold]])
+
+    @property
+    def is_moving(self) -> NDArray[np.bool_]:
+        """Whether the axis moved before each time of the result."""
+        return np.concatenate([[False], self.moving[~self.cold] > 0.5])
+
+    @property
+    def lever(self) -> Array:
+        """Distances from the lower end, (end, freedom), m; 0 where lengths have no effect."""
+        along = np.array([name == DOF[direction_of(self.axis)] for name in self.freedoms])
+        return np.asarray((self.position - self.position[0])[:, None] * along)
+
+
+def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
+    """Return the readings of a moving axis that follow their schema.
 
     Raises
     ------
@@ -63,71 +136,121 @@ def identify_moving(raw: xr.Dataset, settings: Settings, info: MethodInfo, state
     P = np.asarray(raw["end_position"].values, dtype=float)
     _check(time, moving, P)
     order = np.argsort(P)
-    x = np.asarray(raw["end_deviation"].transpose("freedom", "cycle", "end").values, dtype=float)[..., order]
-    cold = time <= 0.0
-    noise = np.array([_noise(values[~cold]) if stated is None else stated for values in x])  # (freedom,)
-    known = np.isfinite(x[:, cold]).sum(axis=1)  # (freedom, end)
-    if not known.all():
+    x = np.asarray(raw["end_deviation"].transpose("cycle", "end", "freedom").values, dtype=float)[:, order]
+    if not np.isfinite(x[time <= 0.0]).any(axis=0).all():
         raise MethodError("end_deviation: expected a reading of each freedom and end in the cold state; found none")
     if missing := int(np.isnan(x).sum()):
         notes.append(f"{missing} of {x.size} readings are missing.")
-    change = x - np.nanmean(x[:, cold], axis=1, keepdims=True)
-    t = np.concatenate([[0.0], time[~cold]])
-    value = np.concatenate([np.zeros_like(change[:, :1]), change[:, ~cold]], axis=1)  # (freedom, time, end)
-    u_cold = noise[:, None] / np.sqrt(known)
-    relative = length_uncertainty(raw, settings)
+    stated = raw["reading_scatter"].values if "reading_scatter" in raw else np.zeros(len(freedoms))
+    noise = np.array([_noise(x[time > 0.0, :, k]) for k in range(len(freedoms))])
     if note := assumed_length(raw, settings):
         notes.append(note)
-    along = DOF[direction_of(axis)]
-    lever = np.array([relative * (P[order] - P[order][0]) if name == along else np.zeros(2) for name in freedoms])
-    names = iso_names(axis)
-    sources, groups, rows = [], [], []
-    for k, name in enumerate(freedoms):
-        for end in range(2):
-            effect = np.zeros((t.size, 2, 6))
-            effect[1:, end, DOF.index(name)] = -u_cold[k, end]
-            sources.append(f"cold reference of {names[name]} at P{end + 1}")
-            groups.append(COLD)
-            rows.append(effect)
-    if (lever > 0).any():
-        effect = np.zeros((t.size, 2, 6))
-        effect[1:, :, DOF.index(along)] = lever[freedoms.index(along)]
-        sources.append(LENGTH)
-        groups.append(LENGTH)
-        rows.append(effect)
-    values, own = np.full((t.size, 2, 6), np.nan), np.zeros((t.size, 2, 6))
-    for k, name in enumerate(freedoms):
-        values[..., DOF.index(name)] = value[k]
-        own[1:, :, DOF.index(name)] = noise[k] ** 2
-    influence = np.array(rows)
-    covariance = np.einsum("stpi,stpj->tpij", influence, influence)
-    covariance[..., range(6), range(6)] += own
-    is_moving = np.concatenate([[False], moving[~cold] > 0.5])
-    figures = [_figures(v, t, is_moving, n, c, h) for v, n, c, h in zip(value, noise, u_cold, lever, strict=True)]
-    return build_errors(
-        values,
-        covariance,
+    length = length_uncertainty(raw, settings)
+    return Evaluated(axis, freedoms, time, moving, P[order], x, order, np.fmax(noise, stated), length, notes)
+
+
+def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
+    """Return the readings of a moving axis as a measurement model, with its errors over time at both ends."""
+    t, lever, count = evaluated.t, evaluated.lever, len(evaluated.freedoms)
+    names = [iso_names(evaluated.axis)[name] for name in evaluated.freedoms]
+    notes = [*evaluated.notes]
+    cycle, place = (i.ravel() for i in np.indices(evaluated.x.shape[:2]))
+    end = np.argsort(evaluated.order)[place]  # in the order of the record
+    warm = ~evaluated.cold[cycle]
+    row = 2 * np.where(warm, np.cumsum(~evaluated.cold)[cycle], 0) + end
+    y = evaluated.x[cycle, end]
+    known = np.zeros((2 * t.size, count))
+    known[row[warm]] = np.where(np.isfinite(y[warm]), 0.0, np.nan)
+    free = np.isfinite(known)
+    free[:2] = False
+    of_scale = lever[end] * warm[:, None]
+
+    def equation(y: Array, u: Unknowns[Array], c: Known[Array]) -> Array:
+        return np.asarray(y + c.length * of_scale - u.cold - u.error)
+
+    names_of_length = [LENGTH] if lever.any() and evaluated.length > 0 else []
+    ids = certified(raw.attrs, {LENGTH: ("tracker", "scale")} if names_of_length else {})
+    return Observed(
+        problem=Problem(
+            equation=equation,
+            readings=y,
+            unknowns=Unknowns(
+                error=Block(start=np.zeros(known.shape), index=row, scale=1.0, free=free),
+                cold=Block(start=np.zeros((2, count)), index=end, scale=1.0, group=COLD),
+            ),
+            constants=Known(
+                Constant(
+                    value=np.zeros((1, 1)),
+                    factor=np.full((1, 1, len(names_of_length)), evaluated.length),
+                    index=np.zeros_like(row),
+                    scale=1.0,
+                    group=LENGTH,
+                    names=names_of_length,
+                    identity=[ids.get(name, "") for name in names_of_length],
+                )
+            ),
+            noise=Noise(sd=np.broadcast_to(np.maximum(evaluated.noise, EQUAL), y.shape)),
+        ),
+        places=Places(lambda x, _: x.error + known, len(known)),
+        recorded=("end_deviation", ("cycle", "end", "freedom")),
+        freedoms=evaluated.freedoms,
         dims=("time", "position"),
-        coords={"time": t, "xyz"[direction_of(axis)]: ("position", P[order], {"units": "m"})},
-        component=axis,
-        machine=str(raw.attrs.get("machine", "unknown")),
+        coords={
+            "time": t,
+            "xyz"[direction_of(evaluated.axis)]: ("position", evaluated.position, {"units": "m"}),
+            "freedom": names,
+            "quantity": list(QUANTITIES),
+            "measure": list(MEASURES),
+        },
+        component=evaluated.axis,
         frame=str(raw.attrs.get("frame", "machine")),
-        functional_point=point_of(raw, settings, notes),
+        functional_point=point_of(raw, settings, notes).tolist(),
         reference="cold state before the axis moved, at each end",
-        reference_interval=(0.0, 0.0),
-        method=info.id,
-        method_version=info.version,
-        provenance=provenance.make(settings, raw, None, steps=["less the mean of the cold state"]),
-        influence=influence,
-        sources=sources,
-        source_groups=groups,
-        reference_sources=[name for name, group in zip(sources, groups, strict=True) if group == COLD],
-        source_ids=certified(raw.attrs, {LENGTH: ("tracker", "scale")} if LENGTH in sources else {}),
-        extras=_extras(figures, [names[name] for name in freedoms], is_moving, noise),
-        start=start_of(raw),
-        measured=raw.attrs,
+        shared=COLD,
+        robust=False,  # nothing contradicts a reading of an instant
+        reliability=False,
+        noise_increases=False,
+        finish=lambda solved: _finished(solved, names),
+        extras={
+            "moving": xr.DataArray(
+                evaluated.is_moving.astype(float), dims="time", attrs={"long_name": "1 while the axis moved"}
+            ),
+            "reading_noise": xr.DataArray(evaluated.noise, dims="freedom", attrs={"long_name": "m, rad"}),
+        },
+        attributes={"reference_interval": (0.0, 0.0)},
         notes=notes,
     )
+
+
+def _finished(solved: Solved, names: list[str]) -> Solved:
+    """Return a solution whose cold reference has the name of its freedom and end."""
+    sources = []
+    for source in solved.relative.errors.sources:
+        place, k = np.unravel_index(int(np.nanargmax(np.abs(source.effect))), source.effect.shape)
+        name = f"cold reference of {names[k]} at P{place % 2 + 1}" if source.group == COLD else source.name
+        sources.append(replace(source, name=name))
+    reference = {"reference_sources": [source.name for source in sources if source.group == COLD]}
+    observed = replace(solved.observed, attributes={**solved.observed.attributes, **reference})
+    relative = replace(solved.relative, errors=replace(solved.relative.errors, sources=sources))
+    return replace(solved, observed=observed, relative=relative, scatter=replace(solved.scatter, note=""))
+
+
+def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:  # noqa: ARG001
+    """Return the figures of ISO 230-3: ranges and changes at both ends and of the length between them."""
+    value = solved.relative.errors.value.reshape(evaluated.t.size, 2, -1)
+    u_cold = evaluated.noise / np.sqrt(np.isfinite(evaluated.x[evaluated.cold]).sum(axis=0))  # (end, freedom)
+    lever = evaluated.length * evaluated.lever
+    found = [
+        _figures(value[..., k], evaluated.t, evaluated.is_moving, float(noise), u_cold[:, k], lever[:, k])
+        for k, noise in enumerate(evaluated.noise)
+    ]
+    attrs = {"long_name": "ISO 230-3, thermal distortion by the moving axis; m, rad"}
+    return {
+        name: xr.DataArray(np.array(values), dims=("freedom", "quantity", "measure"), attrs=attrs)
+        for name, values in zip(
+            ("distortion", "distortion_bias", "distortion_u"), zip(*found, strict=True), strict=True
+        )
+    }
 
 
 def _check(time: Array, moving: Array, P: Array) -> None:
@@ -191,20 +314,3 @@ def _until(x: Array, t: Array, end: float, variance: float) -> tuple[Array, Arra
     share = (end - t[before - 1]) / (t[before] - t[before - 1])
     value = (1.0 - share) * x[before - 1] + share * x[before]
     return np.append(inside, value), np.append(variances, variance * ((1.0 - share) ** 2 + share**2))
-
-
-def _extras(
-    figures: list[tuple[Array, Array, Array]], freedoms: list[str], moving: NDArray[np.bool_], noise: Array
-) -> dict[str, xr.DataArray]:
-    coords: dict[str, Any] = {"freedom": freedoms, "quantity": list(QUANTITIES), "measure": list(MEASURES)}
-    dims = tuple(coords)
-    attrs = {"long_name": "ISO 230-3, thermal distortion by the moving axis; m, rad"}
-    return {
-        name: xr.DataArray(np.array(values), coords, dims, attrs=attrs)
-        for name, values in zip(
-            ("distortion", "distortion_bias", "distortion_u"), zip(*figures, strict=True), strict=True
-        )
-    } | {
-        "moving": xr.DataArray(moving.astype(float), dims="time", attrs={"long_name": "1 while the axis moved"}),
-        "reading_noise": xr.DataArray(noise, {"freedom": freedoms}, "freedom", attrs={"long_name": "m, rad"}),
-    }

@@ -1,93 +1,101 @@
-"""Variation of the readings of one freedom: scatter from reading to reading, and drift from run to run.
+"""Variation of the readings along one line: scatter from reading to reading, and drift from run to run.
 
 Model of a reading of approach a, run j, target i, with the position scaled to z = -1 ... 1::
 
-    x_aji = mu_ai + (o_j + q_j z_i) +- (p_j + w_j z_i) + e_aji
+    x_aji = mu_i +- b_i + (o_j + q_j z_i) +- (p_j + w_j z_i) + e_aji
 
 ``o`` and ``q`` are an offset and a slope that both approaches of a run share (drift of the machine, expansion of its
-scale); ``p`` and ``w`` have opposite signs forward and backward. All are independent from run to run. The coefficients
-are those of a least-squares line of each run and approach, about the means of the targets; half their sum and half
-their difference over the approaches determine the four variances, with n - 1 degrees of freedom each.
+scale); ``p`` and ``w`` have the sign of the approach. All are independent from run to run: random effects, whose
+variances and that of e are estimated by restricted likelihood (`errormotion.estimation.components`). If no reading is
+missing, and no variance is 0, these are the estimates of an analysis of variance.
 
-If a variance is estimated with v degrees of freedom, the standardised mean has a Student distribution. Its standard
-deviation is larger by sqrt(v / (v - 2)) (JCGM 101:2008, 6.4.9.4); the stated uncertainty includes this factor.
+An estimated variance has the Student factor of `errormotion.estimation.variance.expansion`, with which an interval of
+k = 2 contains the truth in 95 % of all cases or more, whatever the degrees of freedom. It belongs to the variance of a
+mean, not to that of the random effect alone: the offset of a mean curve has the variance ``V = (s_o + g s_e) / n`` with
+the variance s_e of e and a constant g. V has a chi-square distribution of n - 1 degrees of freedom, while its part s_o,
+the difference of two estimates, has far fewer and may be 0. What V lacks is stated as part of s_o.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from errormotion.arrays import Array
-from errormotion.errors import MethodError
+from errormotion.errors import FitError, MethodError
+from errormotion.estimation.blocks import Block, Noise
+from errormotion.estimation.components import NOISE, Components, components
+from errormotion.estimation.problem import READINGS, Problem
+from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF, direction_of
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
-DRIFTS = ("offset", "slope")
+T = TypeVar("T")
+EFFECTS = ("offset", "slope", "opposite offset", "opposite slope")
+"""Random effects of a run."""
 MIN_RUNS = 4
-"""For which the variance of the drift has a Student factor, v / (v - 2) with v = n - 1 above 2."""
+"""For an estimate of the drift: with fewer runs, its Student factor would exceed 2."""
+MIN_FREEDOM = 3
+"""Smallest number of degrees of freedom for the scatter of all readings."""
 SIGNIFICANT = 1e-3
 """Probability in Bartlett's test of equal variances below which each target has its own variance."""
+EQUAL = 1e-15
+"""Standard deviation below which readings are exactly equal, m or rad."""
 
 
-@dataclass(frozen=True)
+class Unknowns(NamedTuple, Generic[T]):
+    """Mean and half reversal at each target, and the effects of each run."""
+
+    curve: T
+    run: T
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Scatter:
-    """Variances of one freedom, m^2 or rad^2.
+    """Variances along one line, m^2 or rad^2.
 
     Attributes
     ----------
-    z : ndarray, (target,)
-        Scaled position.
     own : ndarray, (approach, target)
         Of one reading, independent from reading to reading; estimate.
-    own_factor : float
-        Student factor of ``own`` in a variance of a mean.
-    common, opposite : ndarray, (2,)
-        Of offset and slope of a run that the approaches share, and of those with opposite signs; estimates.
-    common_mean, opposite_mean : ndarray, (2,)
-        The same for the mean of one run: with Student factor and stated drift, minus the part that is already contained
-        in ``own``.
+    own_freedom : float
+        Its degrees of freedom; infinite if it is stated.
+    own_stated : ndarray, (approach, target)
+        The same with its Student factor, at least the stated one.
+    run : ndarray, (4,)
+        Of the effects of a run, in the order of `EFFECTS`; estimate, at least the stated one.
+    run_stated : ndarray, (4,)
+        The same for the mean of several runs: with the Student factors of the mean curves.
+    noise : ndarray, (4,)
+        Variance of the same coefficients of the readings of one run, by ``own``.
+    freedom : ndarray, (4,)
+        Degrees of freedom of ``run + noise``; 0 where it is stated.
     pooled : bool
         Whether all targets have one variance.
-    freedom : int
-        Degrees of freedom of ``common`` and ``opposite``; 0 where they are stated.
-    noise : ndarray, (2,)
-        Variance of the coefficients of a run by ``own``, which has been subtracted.
     unequal : bool
         Whether the variances of the targets differ significantly, with too few runs for one of each: it is then at
         least the common one.
     """
 
-    z: Array
     own: Array
-    own_factor: float
-    common: Array
-    opposite: Array
-    common_mean: Array
-    opposite_mean: Array
-    pooled: bool
-    freedom: int
+    own_freedom: float
+    own_stated: Array
+    run: Array
+    run_stated: Array
     noise: Array
+    freedom: Array
+    pooled: bool
     unequal: bool = False
 
 
-def scaled(position: Array) -> Array:
-    """Return positions scaled to -1 ... 1 about their mean, in units of half their range."""
-    return np.asarray((position - position.mean()) / (np.ptp(position) / 2.0))
-
-
 def scatter(
-    x: Array,
-    position: Array,
-    *,
-    kind: Literal["auto", "pooled", "target", "stated"],
-    drift: float | None,
-    stated: float | None,
+    x: Array, z: Array, *, kind: Literal["auto", "pooled", "target"], drift: float | None, stated: float | None
 ) -> Scatter:
     """Return the variances of readings (approach, run, target).
 
@@ -95,57 +103,64 @@ def scatter(
     ----------
     x : ndarray
         NaN for missing readings.
-    position : ndarray, (target,)
-        m.
-    kind : {"auto", "pooled", "target", "stated"}
-        Whether each target has its own variance; with ``stated``, ``drift`` and ``stated`` replace all estimates.
+    z : ndarray, (target,)
+        Position, scaled to -1 ... 1.
+    kind : {"auto", "pooled", "target"}
+        Whether each target has its own variance.
     drift : float, optional
-        Stated standard deviation of a run of one approach by drift; a smaller estimate is replaced by it.
+        Standard deviation of a run of one approach by drift; a smaller estimate is replaced by it.
     stated : float, optional
-        Standard deviation of a reading, for a single run.
+        Standard deviation of a reading; a smaller estimate is replaced by it.
 
     Raises
     ------
     MethodError
         Too few runs to estimate what is not stated.
     """
-    z = scaled(position)
-    Z = np.stack([np.ones_like(z), z], axis=1)
-    approaches = [a for a in range(2) if np.isfinite(x[a]).any()]
-    runs = x.shape[1]
-    stated_drift = np.array([0.0 if drift is None else drift**2 / len(approaches), 0.0])
-    if runs == 1 or kind == "stated":
-        return _stated(x, z, stated, drift, stated_drift)
+    known = np.isfinite(x)
+    measured = known.any(axis=(1, 2))
+    both, runs = bool(measured.all()), x.shape[1]
+    seen = known.any(axis=1)
+    least = np.array([0.0 if drift is None else drift**2 / measured.sum(), 0.0] * 2) * [1, 1, both, both]
+    if runs == 1 and (stated is None or drift is None):
+        raise MethodError(
+            "The scatter of the readings cannot be estimated from one run. Measure more runs, or state the settings "
+            "uncertainty.scatter and uncertainty.drift."
+        )
     if drift is None and runs < MIN_RUNS:
         raise MethodError(
             f"Expected {MIN_RUNS} runs or more, or the drift during one run (setting uncertainty.drift); found "
             f"{runs} runs: the drift from run to run cannot be estimated."
         )
-    residual, coefficient, g = _lines(x, Z)
-    own, factor, pooled, unequal = _own(residual, kind)
-    mean_own = float(np.nanmean(own))
-    own = np.where(np.isnan(own) & np.isfinite(x).any(axis=1), mean_own, own)  # readings of runs without a line
-    both = len(approaches) == 2
-    half_sum = coefficient.mean(axis=0) if both else coefficient[approaches[0]]
-    half_difference = (coefficient[0] - coefficient[1]) / 2.0 if both else np.zeros_like(half_sum)
-    noise = mean_own * g / len(approaches)
-    common, opposite = (_mean_square(part) for part in (half_sum, half_difference))
+    if runs == 1 or _equal(x):
+        own = np.where(seen, 0.0 if stated is None else stated**2, np.nan)
+        return Scatter(
+            own=own, own_freedom=np.inf, own_stated=own, run=least, run_stated=least, noise=np.zeros(4),
+            freedom=np.zeros(4), pooled=True,
+        )  # fmt: skip
+    _check_freedom(known)
+    found = _estimated(x, z, None, both)
+    own, freedom, pooled, unequal = _own(found, x.shape, kind)
+    own = np.where(seen, own, np.nan)
+    if not pooled:
+        found = _estimated(x, z, own, both)
+    run, noise, of_run = _of_runs(found, z, both)
+    student = np.square(expansion(freedom))
     if runs >= MIN_RUNS:
-        student = (runs - 1) / (runs - 3)
-        common_mean, opposite_mean = (np.maximum(student * part - noise, 0.0) for part in (common, opposite))
+        more = (np.square(expansion(of_run)) - 1.0) * (run + noise) - (student - 1.0) * noise
+        run_stated = run + np.maximum(more, 0.0) * [1, 1, both, both]
     else:
-        common_mean, opposite_mean = np.zeros(2), np.zeros(2)
+        run_stated, of_run = run, np.zeros(4)
+    smallest = 0.0 if stated is None else stated**2
     return Scatter(
-        z=z,
-        own=own,
-        own_factor=factor,
-        common=np.maximum(common - noise, stated_drift),
-        opposite=np.maximum(opposite - noise, stated_drift) if both else np.zeros(2),
-        common_mean=np.maximum(common_mean, stated_drift),
-        opposite_mean=np.maximum(opposite_mean, stated_drift) if both else np.zeros(2),
-        pooled=pooled,
-        freedom=runs - 1 if runs >= MIN_RUNS else 0,
+        own=np.maximum(own, smallest),
+        own_freedom=freedom,
+        own_stated=np.maximum(student * own, smallest),
+        run=np.maximum(run, least),
+        run_stated=np.maximum(run_stated, least),
         noise=noise,
+        freedom=of_run,
+        pooled=pooled,
         unequal=unequal,
     )
 
@@ -165,79 +180,103 @@ def lacking(settings: Settings) -> dict[str, str]:
     return {"runs": f"expected {MIN_RUNS} runs or more{other}, to estimate scatter and drift; found {settings.runs}"}
 
 
-def _stated(x: Array, z: Array, stated: float | None, drift: float | None, stated_drift: Array) -> Scatter:
-    if stated is None or drift is None:
-        raise MethodError(
-            "The scatter of the readings cannot be estimated from one run. Measure more runs, or state the settings "
-            "uncertainty.scatter and uncertainty.drift."
-        )
-    own = np.where(np.isfinite(x).any(axis=1), stated**2, np.nan)
-    return Scatter(z, own, 1.0, stated_drift, stated_drift, stated_drift, stated_drift, True, 0, np.zeros(2))
+def _equal(x: Array) -> bool:
+    """Return whether the readings of all runs are exactly equal."""
+    return bool(np.nanmax(np.fmax.reduce(x, axis=1) - np.fmin.reduce(x, axis=1)) < EQUAL)
 
 
-def _lines(x: Array, Z: Array) -> tuple[Array, Array, Array]:
-    """Return residuals of a line in each run about the means of the targets, its coefficients, and their cofactors.
-
-    Shapes (approach, run, target), (approach, run, 2) and (2,).
-    """
-    known = np.isfinite(x)
-    n = known.sum(axis=1, keepdims=True)
-    mean = np.where(known, x, 0.0).sum(axis=1, keepdims=True) / np.maximum(n, 1)
-    centred = np.where(known & (n > 1), x - mean, np.nan)
-    residual, (coefficient, cofactors) = np.full_like(x, np.nan), np.full((2, *x.shape[:2], 2), np.nan)
-    there = np.isfinite(centred)
-    for here in np.unique(there.reshape(-1, len(Z)), axis=0):  # runs with readings at the same targets
-        if here.sum() < 3 or np.ptp(Z[here, 1]) == 0:
-            continue
-        runs = (there == here).all(axis=-1)
-        normal = np.linalg.inv(Z[here].T @ Z[here])
-        readings = centred[runs][:, here, None]
-        fitted = normal @ Z[here].T @ readings
-        coefficient[runs] = fitted[..., 0]
-        residual[runs[..., None] & here] = (readings - Z[here] @ fitted).ravel()
-        cofactors[runs] = np.diagonal(normal)
-    usable = np.isfinite(cofactors[..., 0])
-    if not usable.any():
-        raise MethodError("deviation: expected runs with readings at three targets or more; found none")
-    return residual, coefficient, cofactors[usable].mean(axis=0)
-
-
-def _own(residual: Array, kind: str) -> tuple[Array, float, bool, bool]:
-    """Return the variance of one reading (approach, target), its Student factor, whether it is pooled, and unequal."""
-    known = np.isfinite(residual)
+def _check_freedom(known: NDArray[np.bool_]) -> None:
+    """Refuse readings with too few degrees of freedom left by the means of the targets and a line for each run."""
     n = known.sum(axis=1)
-    square = np.where(known, residual**2, 0.0).sum(axis=1)
-    runs = known.any(axis=2).sum(axis=1)
-    lost = 2 * np.maximum(runs - 1, 0).sum()  # lines of all runs but one, which the means of the targets contain
-    total = int(np.maximum(n - 1, 0).sum())
-    freedom = total - int(lost)
-    if freedom < 3:
+    usable = known & (n > 1)[:, None]
+    lines = np.minimum(usable.sum(axis=2), 2).sum(axis=1) - 2 * usable.any(axis=(1, 2))  # the means contain one
+    freedom = int(np.maximum(n - 1, 0).sum() - np.maximum(lines, 0).sum())
+    if freedom < MIN_FREEDOM:
         raise MethodError(
-            f"Too few readings to estimate their scatter: expected 3 degrees of freedom or more; found {freedom}. "
-            "Measure more targets or runs."
+            f"Too few readings to estimate their scatter: expected {MIN_FREEDOM} degrees of freedom or more; found "
+            f"{freedom}. Measure more targets or runs."
         )
-    pooled = float(square.sum() / freedom)
-    if kind == "pooled" or (kind == "auto" and not _differ(square, n)):
-        return np.where(n > 0, pooled, np.nan), freedom / (freedom - 2), True, False
-    share = freedom / total
-    each = np.where(n > 1, square / np.maximum(n - 1, 1) / share, pooled)
-    own_freedom = share * (float(np.median(n[n > 0])) - 1.0)
-    if own_freedom > 2:
-        return np.where(n > 0, each, np.nan), own_freedom / (own_freedom - 2), False, False
+
+
+def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
+    """Return the variances of the runs' effects and of a reading, whose ratios are those of ``own``."""
+    a, j, i = (index.ravel() for index in np.indices(x.shape))
+    sign, one = np.where(a == 0, 1.0, -1.0), np.ones(a.size)
+    designs = Unknowns(np.stack([one, sign], axis=1), np.stack([one, z[i], sign, sign * z[i]], axis=1))
+    used = np.array([True, True, both, both])
+    known = np.isfinite(x)
+    seen = known.any(axis=1)
+    rows = Unknowns(i, j)
+
+    def equation(y: Array, u: Unknowns[Array], _: object) -> Array:
+        return np.asarray(y - sum(np.einsum("nk,nk->n", A, each) for A, each in zip(designs, u, strict=True)))
+
+    derivatives = {name: -A[:, None] for name, A in zip(Unknowns._fields, designs, strict=True)}
+    derivatives[READINGS] = np.ones((a.size, 1, 1))
+    mean = np.where(known, x, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    centred = x - mean[:, None]  # which the means of the targets contain: rounding is that of the scatter
+    spread = float(np.sqrt(np.mean(np.square(centred[known]))))
+    sd = np.full(a.size, spread) if own is None else np.sqrt(np.maximum(own, EQUAL**2))[a, i]
+    problem = Problem(
+        equation=equation,
+        readings=centred.ravel(),
+        unknowns=Unknowns(
+            Block(
+                start=np.zeros((z.size, 2)),
+                index=rows.curve,
+                scale=1.0,
+                free=np.stack([seen.any(axis=0), seen.all(axis=0)], axis=1),
+            ),
+            Block(
+                start=np.zeros((x.shape[1], 4)),
+                index=rows.run,
+                scale=1.0,
+                free=np.tile(used, (x.shape[1], 1)),
+                group="runs",
+                component=tuple(np.where(used, EFFECTS, "")),
+            ),
+        ),
+        noise=Noise(sd=np.nan_to_num(sd, nan=spread), stated=False),
+        derivatives=lambda *_: derivatives,
+    )
+    try:
+        return components(problem)
+    except FitError as error:
+        raise MethodError(f"deviation: expected readings that determine their scatter; {error}.") from error
+
+
+def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, float, bool, bool]:
+    """Return the variance of a reading (approach, target), its degrees of freedom, whether it is pooled, and unequal.
+
+    The sum of squares of the residuals at a target has the expectation of the variance times their redundancy.
+    """
+    at = found.names.index(NOISE)
+    noise = found.fit.problem.noise.sd
+    pooled, freedom = float(np.square(np.nanmin(np.asarray(noise)))), float(found.freedom[at])
+    residual, left = found.fit.residual[:, 0], 1.0 - found.fit.leverage[:, 0]
+    known = np.isfinite(residual)
+    square = np.where(known, np.square(residual), 0.0).reshape(shape).sum(axis=1)
+    redundancy = np.where(known, left, 0.0).reshape(shape).sum(axis=1)
+    if kind == "pooled" or (kind == "auto" and not _differ(square, redundancy)):
+        return np.full(square.shape, pooled), freedom, True, False
+    each = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), pooled)
+    of_each = float(np.median(redundancy[redundancy > 0.5]))
+    if of_each > 2:
+        return each, of_each, False, False
     if kind == "auto":
-        return np.where(n > 0, np.maximum(each, pooled), np.nan), freedom / (freedom - 2), True, True
+        return np.maximum(each, pooled), freedom, False, True
+    least = int(np.ceil(2.0 * shape[1] / of_each)) + 1
     raise MethodError(
-        f"Variances by target: expected {int(2 / share) + 2} runs or more at these targets; found {int(n.max())}. Use "
-        "scatter 'pooled'."
+        f"Variances by target: expected {least} runs or more at these targets; found {shape[1]}. Use scatter 'pooled'."
     )
 
 
-def _differ(square: Array, n: Array) -> bool:
+def _differ(square: Array, redundancy: Array) -> bool:
     """Return whether the variances of the targets differ significantly (Bartlett's test)."""
-    usable = (n > 2) & (square > 0)
+    usable = (redundancy > 1) & (square > 0)
     if usable.sum() < 2:
         return False
-    k, v = usable.sum(), (n[usable] - 1).astype(float)
+    k, v = usable.sum(), redundancy[usable]
     variance = square[usable] / v
     pooled = (v @ variance) / v.sum()
     if not pooled > 0:
@@ -247,9 +286,30 @@ def _differ(square: Array, n: Array) -> bool:
     return bool(special.chdtrc(k - 1, statistic / correction) < SIGNIFICANT)
 
 
-def _mean_square(part: Array) -> Array:
-    """Return the variance of coefficients (run, 2) over the runs, (2,)."""
-    known = part[np.isfinite(part).all(axis=1)]
-    if len(known) < 2:
-        return np.zeros(2)
-    return np.asarray(((known - known.mean(axis=0)) ** 2).sum(axis=0) / (len(known) - 1))
+def _of_runs(found: Components, z: Array, both: bool) -> tuple[Array, Array, Array]:
+    """Return the variances of the runs' effects, those of the same coefficients of a run by its noise, and freedoms.
+
+    All (4,). The coefficients are offset and slope of the mean curve and of the reversal, with the variance
+    ``V = (s + noise) / n`` by n runs, of which the fit states the parts.
+    """
+    fit = found.fit
+    free = fit.problem.unknowns.curve.freed
+    a = np.zeros((*free.shape, 4))
+    for k in range(2 if both else 1):
+        here = free[:, k]
+        Z = np.stack([np.ones(int(here.sum())), z[here]], axis=1)
+        a[here, k, 2 * k : 2 * k + 2] = np.linalg.pinv(Z).T
+    q = fit.linear.numbering.size
+    b = np.zeros((q, 4))
+    effect, at_border = fit.normal.solve(a, b)
+    V = np.einsum("rpk,rpk->k", a, effect)
+    by_name = dict(zip(found.names, zip(found.variance, found.used, strict=True), strict=True))
+    run, noise, freedom = np.zeros(4), np.zeros(4), found.freedom_of(a, b)
+    for k, name in enumerate(EFFECTS):
+        if name not in by_name or not V[k] > 0:
+            continue
+        run[k], used = by_name[name]
+        # V = sum of the squared effects of the runs on it, n^-1 s each ... and the part of the noise
+        part = float(np.sum(np.square(at_border[fit.linear.numbering.border[1][:, k], k]))) / used
+        noise[k] = max(V[k] - part, 0.0) * used / part
+    return run, noise, freedom

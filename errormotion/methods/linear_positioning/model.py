@@ -1,0 +1,276 @@
+"""The measurement model of readings along lines: the freedoms of an axis, or diagonals of a volume.
+
+A reading y of line k in run j, approached forward (+) or backward (-), at a target i with the distance l from the zero
+of the instrument and the scaled position z, fulfils, but for its noise,
+
+    g_k (y - [alpha_m (T_m + t_m) - alpha_w (T_w + t_w)] l) + (s + c_k) l
+        = m_ki +- b_ki + r_ki + (o + q z)_kj +- (p + w z)_kj
+
+Unknowns are the mean m and the half reversal b at each target, an error r of the instrument that is alike in all runs,
+and the effects of the runs; their variances, and that of the noise, are those of
+`errormotion.methods.linear_positioning.identification.scatter`. Constants, with the uncertainty that is the source of
+the same name in the budget, are the scale s of the lengths, the alignment c, the gain g, and the coefficients alpha and
+temperatures of what expands (T above the reference). The errors are m; of a straightness, relative to the line through
+its first and its last target.
+
+Alignment: along a line at the angle a to the axis, the length l is measured as ``l cos a``, too short by ``l a^2 / 2``.
+With independent components of standard uncertainty u, a^2 / 2 has an exponential distribution of mean u^2 and standard
+deviation u^2. The readings are not corrected, as the standard defines its figures: c is 0, and its uncertainty is the
+root mean square of this one-sided error, sqrt(2) u^2. Where the alignment is stated, further figures are corrected for
+the mean; their source is the standard deviation.
+
+The figures of ISO 230-2 are no part of the model. They are extremes of means and standard deviations of the readings,
+which the standard states without weights, and their true values follow from draws of the true curves and variances
+(`identification.extremes`), not of the readings. They take the effects of the constants from the solution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.datasets.certificates import certified
+from errormotion.errors import MethodError
+from errormotion.estimation.datum import ROUNDING
+from errormotion.estimation.problem import READINGS
+from errormotion.estimation.sources import Source
+from errormotion.measurement import Block, Constant, Noise, Observed, Problem
+from errormotion.methods.linear_positioning.identification.scatter import EQUAL, Scatter, scatter
+
+if TYPE_CHECKING:
+    from errormotion.measurement.observed import Solved
+    from errormotion.methods.linear_positioning.identification.reading import Readings
+    from errormotion.methods.linear_positioning.settings import Settings
+
+T = TypeVar("T")
+DRIFT, ALIGNMENT, LENGTH, GAIN, EXPANSION, END, NOISE = (
+    *("drift from run to run", "alignment", "scale of the lengths", "gain of the instrument", "expansion"),
+    *("ends of the reference line", "readings"),
+)
+"""Groups of sources."""
+OF_LINE = "angle of the measured line to the axis"
+COEFFICIENT, TEMPERATURE = "coefficient of expansion", "temperature"
+NEGLIGIBLE = 1e-4
+"""Effect of a source, in standard uncertainties of the errors, that is rounding."""
+_EFFECTS = (
+    "offset of the runs",
+    "slope of the runs",
+    "offset of the runs by approach",
+    "slope of the runs by approach",
+)
+
+
+class Unknowns(NamedTuple, Generic[T]):
+    """Columns: mean, half reversal and error of the instrument of each line; the four effects of a run on each."""
+
+    target: T
+    run: T
+
+
+class Known(NamedTuple, Generic[T]):
+    """Constants; columns are lines, or the two sides that expand."""
+
+    length: T
+    alignment: T
+    gain: T
+    coefficient: T
+    temperature: T
+
+
+def spreads_of(readings: Readings, settings: Settings, what: str = "") -> list[Scatter]:
+    """Return the variances of each line; ``what`` it is, for messages, such as "Diagonal "."""
+    spreads = []
+    for k, (x, z) in enumerate(zip(readings.corrected, readings.z, strict=True)):
+        drift, stated = (None if np.isnan(of[k]) else float(of[k]) for of in (readings.drift, readings.scatter))
+        drift = None if drift is None else drift / np.sqrt(12.0)
+        try:
+            spreads.append(scatter(x, z, kind=settings.scatter, drift=drift, stated=stated))
+        except MethodError as error:
+            raise MethodError(f"{what}{readings.names[k]}: {error}") from None
+    return spreads
+
+
+def known_of(readings: Readings) -> Array:
+    """Return 0 where the mean of the measured approaches is known, otherwise NaN, (line, target).
+
+    Raises
+    ------
+    MethodError
+        None is known.
+    """
+    seen: Array = np.any(np.isfinite(readings.x), axis=2)
+    measured = np.any(seen, axis=2)
+    known = np.where((seen | ~measured[..., None]).all(axis=1), 0.0, np.nan)
+    if np.isnan(known).all():
+        raise MethodError(
+            "deviation: expected a target that was reached in all measured directions; found none. Measure more."
+        )
+    return known
+
+
+def problem_of(readings: Readings, spreads: Sequence[Scatter]) -> Problem:
+    """Return the readings, in the order (run, approach, target) as recorded, as a problem of least squares."""
+    count, m = readings.position.shape
+    runs = readings.x.shape[2]
+    run, way, stop = (i.ravel() for i in np.indices((runs, len(readings.approach), len(readings.order))))
+    a, i = readings.approach[way], readings.order[stop]
+    sign = np.where(a == 0, 1.0, -1.0)
+    lever, z = readings.lever[:, i].T, readings.z[:, i].T  # (n, line)
+    sides = readings.sides
+    excess = np.stack([side.excess[a, run, i] for side in sides], axis=1) if sides else np.zeros((a.size, 1))
+    of_side = np.array([side.sign for side in sides] or [0.0])
+    x = np.moveaxis(readings.x, 0, -1)[a, run, i]
+    forward = np.stack([np.ones((a.size, count)), np.broadcast_to(sign[:, None], (a.size, count))])
+    design = np.stack([forward[0], z, forward[1], forward[1] * z])  # (effect, n, line)
+
+    def equation(y: Array, u: Unknowns[Array], c: Known[Array]) -> Array:
+        expansion = np.sum(of_side * c.coefficient * (excess + c.temperature), axis=1, keepdims=True)
+        true = c.gain * (y - expansion * lever) + (c.length + c.alignment) * lever
+        mean, half, at_target = np.split(u.target, 3, axis=1)
+        effects = u.run.reshape(-1, 4, count)
+        return np.asarray(true - mean - sign[:, None] * half - at_target - np.einsum("ank,nak->nk", design, effects))
+
+    line = np.eye(count)
+    derivatives = {
+        "target": -np.concatenate([np.einsum("nk,kl->nkl", A, line) for A in (*forward, forward[0])], axis=2),
+        "run": -np.concatenate([np.einsum("nk,kl->nkl", A, line) for A in design], axis=2),
+        READINGS: np.broadcast_to(line, (a.size, count, count)),
+    }
+    seen: Array = np.any(np.isfinite(readings.x), axis=2)  # (line, approach, target)
+    at_target = np.tile(readings.at_target, (m, 1))
+    free = np.concatenate([seen.any(axis=1).T, seen.all(axis=1).T, at_target > 0], axis=1)
+    prior = np.concatenate([np.full((m, 2 * count), np.inf), np.where(at_target > 0, at_target, np.inf)], axis=1)
+    of_runs = np.sqrt(np.stack([spread.run_stated for spread in spreads], axis=1)).ravel()  # (effect, line)
+    own = np.stack([spread.own_stated for spread in spreads])
+    sd = np.moveaxis(np.sqrt(np.nan_to_num(own)), 0, -1)[a, i]
+    return Problem(
+        equation=equation,
+        readings=x,
+        unknowns=Unknowns(
+            Block(start=np.zeros((m, 3 * count)), index=i, scale=1.0, free=free, prior=prior),
+            Block(
+                start=np.zeros((runs, 4 * count)),
+                index=run,
+                scale=1.0,
+                free=np.tile(of_runs > 0, (runs, 1)),
+                prior=np.where(of_runs > 0, of_runs, np.inf),
+                group=DRIFT,
+            ),
+        ),
+        constants=_constants(readings, np.zeros(a.size, dtype=np.intp)),
+        noise=Noise(sd=np.maximum(sd, EQUAL)),
+        derivatives=lambda *_: derivatives,
+    )
+
+
+def _constants(readings: Readings, one: NDArray[np.intp]) -> Known[Constant]:
+    """Return all constants with their uncertainty; the sign of a source is that of its effect on the errors."""
+    names, sides, along = readings.names, readings.sides, (readings.lever != 0).any(axis=1)
+
+    def constant(value: float, u: Sequence[float] | Array, group: str, sources: Sequence[str]) -> Constant:
+        """Return equal values, each with its own source; without one where ``u`` is 0."""
+        used = np.flatnonzero(u).tolist()
+        named = [sources[k] for k in used]
+        ids = certified(readings.attrs, {name: item for name, item in items.items() if name in named})
+        return Constant(
+            value=np.full((1, len(u)), value),
+            factor=np.diag(u)[None, :, used],
+            index=one,
+            scale=1.0,
+            group=group,
+            names=named,
+            identity=[ids.get(name, "") for name in named],
+        )
+
+    items = {
+        LENGTH: ("tracker", "scale"),
+        f"{COEFFICIENT}, machine": ("scales", "coefficient of expansion"),
+        f"{TEMPERATURE}, machine": ("scale_thermometer", f"offset at {readings.axis}"),
+    }
+    coefficient = constant(
+        0.0,
+        [-side.coefficient_u for side in sides] or [0.0],
+        EXPANSION,
+        [f"{COEFFICIENT}, {side.name}" for side in sides],
+    )
+    u_T = [-side.temperature_u * (side.coefficient != 0) for side in sides] or [0.0]
+    return Known(
+        length=constant(0.0, [readings.length * along.any()], LENGTH, [LENGTH]),
+        alignment=constant(
+            0.0, np.sqrt(2.0) * readings.alignment**2 * along, ALIGNMENT, [f"{OF_LINE}, {name}" for name in names]
+        ),
+        gain=constant(1.0, readings.gain, GAIN, [f"gain of {name}" for name in names]),
+        coefficient=replace(coefficient, value=np.array([[side.coefficient for side in sides] or [0.0]])),
+        temperature=constant(0.0, u_T, EXPANSION, [f"{TEMPERATURE}, {side.name}" for side in sides]),
+    )
+
+
+def observed(readings: Readings, problem: Problem, names: Sequence[str], **others: Any) -> Observed:
+    """Return readings with what the results of axes and diagonals have in common; ``others`` as for `Observed`.
+
+    Outliers are not excluded, and the reliability of single readings is not stated: the figures of the standard are
+    those of all readings.
+    """
+    return Observed(
+        problem=problem,
+        frame=str(readings.attrs.get("frame", "machine")),
+        shared=NOISE,
+        robust=False,
+        reliability=False,
+        noise_increases=False,
+        finish=partial(_finished, names=names),
+        **others,
+    )
+
+
+def _finished(solved: Solved, names: Sequence[str]) -> Solved:
+    """Return a solution in which the runs are one source for each of their effects, and rounding is none.
+
+    The noise has been estimated from the same readings, and is not compared with them again.
+    """
+    errors = solved.relative.errors
+    u = np.sqrt(np.einsum("pdd->pd", errors.covariance))
+    block = solved.fit.problem.unknowns.run
+    of_runs = [source for source in errors.sources if source.group == DRIFT]
+    column = np.argwhere(block.freed & (block.information > 0))[:, 1]
+    drift = [
+        replace(source, name=f"{_EFFECTS[k // len(names)]}, {names[k % len(names)]}{_number(i)}")
+        for k in np.unique(column)
+        for i, source in enumerate(_fewest([of_runs[j] for j in np.flatnonzero(column == k)], u))
+    ]
+    noise = _fewest([source for source in errors.sources if source.group == NOISE], u)
+    kept = [source for source in errors.sources if source.group not in (DRIFT, NOISE)]
+    found = [*drift, *kept, *(replace(source, name=f"{NOISE}{_number(i)}") for i, source in enumerate(noise))]
+    exact = [replace(source, effect=_without_rounding(source.effect)) for source in found]
+    relative = replace(solved.relative, errors=replace(errors, sources=exact))
+    return replace(solved, relative=relative, scatter=replace(solved.scatter, note=""))
+
+
+def _without_rounding(effect: Array) -> Array:
+    """Return an effect that is exactly 0 where it is rounding: a scale at the zero of the instrument."""
+    return np.where(np.abs(effect) > ROUNDING * np.nanmax(np.abs(effect), initial=0.0), effect, 0.0 * effect)
+
+
+def _number(i: int) -> str:
+    return f" {i + 1}" if i else ""
+
+
+def _fewest(sources: Sequence[Source], u: Array) -> list[Source]:
+    """Return the smallest number of sources with the same covariance, without negligible ones."""
+    if not sources:
+        return []
+    unit = np.where(u > 0, u, 1.0)
+    effects = np.array([np.nan_to_num(source.effect / unit).ravel() for source in sources])
+    seen = effects.any(axis=0)
+    _, size, rows = np.linalg.svd(effects, full_matrices=False)
+    return [
+        replace(sources[0], effect=(power * row * seen).reshape(u.shape) * unit)
+        for power, row in zip(size, rows, strict=True)
+        if power > NEGLIGIBLE
+    ]
