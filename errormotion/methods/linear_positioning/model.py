@@ -41,7 +41,7 @@ from errormotion.estimation.datum import ROUNDING
 from errormotion.estimation.problem import READINGS
 from errormotion.estimation.sources import Source
 from errormotion.measurement import Block, Constant, Noise, Observed, Problem
-from errormotion.methods.linear_positioning.identification.scatter import EQUAL, Scatter, scatter
+from errormotion.methods.linear_positioning.identification.scatter import EFFECTS, EQUAL, Scatter, scatter
 
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
@@ -161,6 +161,7 @@ def problem_of(readings: Readings, spreads: Sequence[Scatter]) -> Problem:
                 free=np.tile(of_runs > 0, (runs, 1)),
                 prior=np.where(of_runs > 0, of_runs, np.inf),
                 group=DRIFT,
+                component=tuple(f"{effect} {k + 1}" for effect in EFFECTS for k in range(count)),
             ),
         ),
         constants=_constants(readings, np.zeros(a.size, dtype=np.intp)),

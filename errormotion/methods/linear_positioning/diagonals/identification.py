@@ -101,7 +101,7 @@ def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observ
         model.problem_of(readings, evaluated.spreads),
         readings.names,
         places=Places(
-            lambda x, _: (x.target[np.arange(line.size), line] + known)[:, None], line.size, {"target": stop}
+            lambda x, _: (x.target[np.arange(line.size), line] + known)[:, None], line.size, rows={"target": stop}
         ),
         sensitivity=np.concatenate([units[line], np.zeros((line.size, 3))], axis=1),
         recorded=("diagonal_deviation", ("run", "approach", "stop", "diagonal")),
