@@ -157,7 +157,7 @@ class LinearPositioning(ModelMethod):
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
     def observe(self, raw: xr.Dataset, settings: PositioningSettings) -> Observed:
-        """Return what raw data mean: `errormotion.methods.linear_positioning.model`, or `identification.moving`."""
+        """Return what raw data mean, as stated in `identification.model`, or in `identification.moving`."""
         its = _evaluation(raw)
         observed: Observed = its.observe(raw, its.evaluate(raw, settings), settings)
         return observed
@@ -228,7 +228,7 @@ class LinearPositioning(ModelMethod):
 
     def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""
-        from errormotion.methods.linear_positioning.planning.plan import summary
+        from errormotion.methods.linear_positioning.plan import summary
 
         settings = settings or PositioningSettings()
         planned = super().plan(settings)

@@ -14,9 +14,8 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.measurement import Observed, Places
-from errormotion.methods.linear_positioning import model
 from errormotion.methods.linear_positioning.diagonals.lines import squareness_of
-from errormotion.methods.linear_positioning.identification import standard
+from errormotion.methods.linear_positioning.identification import model, standard
 from errormotion.methods.linear_positioning.identification.identify import Evaluated, figures_of
 from errormotion.methods.linear_positioning.identification.reading import (
     MIN_TARGETS,

@@ -13,8 +13,7 @@ from errormotion.errors import MethodError
 from errormotion.estimation.extremes import Extremes
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.measurement import Datum, Observed, Places
-from errormotion.methods.linear_positioning import model
-from errormotion.methods.linear_positioning.identification import extremes, standard
+from errormotion.methods.linear_positioning.identification import extremes, model, standard
 from errormotion.methods.linear_positioning.identification.reading import Readings, point_of, read, zero_of
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS

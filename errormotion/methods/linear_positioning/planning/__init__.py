@@ -1,1 +1,1 @@
-"""Targets, the order of their approaches, NC programs, and the expected uncertainty."""
+"""Targets, the order of their approaches, and NC programs."""
