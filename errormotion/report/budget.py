@@ -33,10 +33,10 @@ def sigma(errors: xr.Dataset) -> np.ndarray:
     return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
 
-def table(errors: xr.Dataset, when: str, along: str = "") -> Table:
+def table(errors: xr.Dataset, when: str, noise: str = _INDEPENDENT) -> Table:
     """Return the budget table at one position or time; ``errors`` has no such dims.
 
-    ``along`` is the name of a place, such as ``instant``, from one to another of which the noise is independent.
+    ``noise`` is the name of the part that is independent from place to place.
     """
     groups = groups_at(errors)
     names, own = errors.em.names, errors.em.iso_names()
@@ -57,18 +57,16 @@ def table(errors: xr.Dataset, when: str, along: str = "") -> Table:
         f"{'six error motions at the functional point' if len(names) > 1 else names[0]}, by group of sources.",
         ["source", *(f"{own[name]} / {unit}" for name, (unit, _) in zip(names, units, strict=True))],
         [
-            *(row(readable(name, along), values) for name, values in groups.items()),
+            *(row(noise if name == "independent" else readable(name), values) for name, values in groups.items()),
             row("combined, k = 1", combined),
             row("expanded, k = 2", 2 * combined),
         ],
     )
 
 
-def readable(group: str, along: str = "") -> str:
-    """Return the readable name of a group of sources; ``along`` as in `table`."""
-    if group != "independent":
-        return group.replace("_", " ")
-    return f"noise, independent from {along} to {along}" if along else _INDEPENDENT
+def readable(group: str) -> str:
+    """Return the readable name of a group of sources."""
+    return _INDEPENDENT if group == "independent" else group.replace("_", " ")
 
 
 def largest(errors: xr.Dataset, freedom: str) -> tuple[str, str] | None:

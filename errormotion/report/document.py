@@ -66,10 +66,27 @@ class Table:
     notes: Sequence[str] = ()
 
     @property
+    def wide(self) -> bool:
+        """Whether its columns need smaller letters to fit beside one another."""
+        texts = [[str(name) for name in self.head], *([_shown(cell) for cell in row] for row in self.rows)]
+        columns = zip(*(row for row in texts[1:] if len(row) == len(self.head)), strict=True)
+        return self.numeric and (len(self.head) > 7 or sum(2 + max(map(len, column)) for column in columns) > _FITTING)
+
+    @property
     def footnotes(self) -> dict[str, str]:
         """Marks of all reasons in cells, in reading order: a, b, c ..."""
         reasons = (cell.reason for row in self.rows for cell in row if isinstance(cell, Cell) and cell.reason)
         return {reason: _mark(i) for i, reason in enumerate(dict.fromkeys(reasons))}
+
+
+_FITTING = 104
+"""Characters of a row that fit in letters of the usual size, with two for the room of each column."""
+
+
+def _shown(cell: Cell | str) -> str:
+    if not isinstance(cell, Cell):
+        return str(cell)
+    return f"{cell.text} ± {cell.uncertainty}" if cell.uncertainty else str(cell.text)
 
 
 def _mark(index: int) -> str:

@@ -19,10 +19,12 @@ from errormotion.report.elements import (
     KeyFigures,
     Map,
     Of,
+    On,
     Own,
     PolarPlot,
     Section,
     Sentence,
+    Spans,
     Table,
 )
 from errormotion.report.exports.tables import sheet
@@ -311,3 +313,44 @@ def test_a_chapter_is_a_sequence_of_parts():
     assert made.summary[0] == "Measured at 24 angles."
     assert [section.name for section in made.sections] == ["budget"]
     assert made.sections[0].blocks[1].text == "p3-budget-1 of p1"
+
+
+def test_a_row_without_values_states_its_reason_once():
+    errors = over_angles().assign(gone=("line", [np.nan, np.nan]))
+    columns = (Column("gone", reason="why"), Column("gone", reason="why"))
+    (table,) = blocks_of(Table("Gone.", columns, over="line"), errors=errors)
+    assert table.rows[1][1:] == [Cell("—", reason="the sphere has moved"), Cell("—")]
+
+
+def test_parts_read_a_selection_of_the_dataset():
+    def half(errors):
+        return errors.isel(angle=slice(0, 12)).assign_attrs(half="the first half")
+
+    (table,) = blocks_of(On(half, (Table("Errors of {half}.", (Column("EX"),), over="angle"),)))
+    assert table.caption == "Errors of the first half."
+    assert len(table.rows) == 12
+    assert blocks_of(On(lambda errors: None, (Curves(),))) == []
+
+
+def test_a_wide_table_has_smaller_letters():
+    columns = tuple(Column("EX", head=f"error {k}") for k in range(7))
+    narrow, wide = blocks_of(Table("", columns[:5], over="angle"), Table("", columns, over="angle"))
+    assert (narrow.wide, wide.wide) == (False, True)
+    long = tuple(
+        Column(lambda errors: errors["EX"] * 1e3, uncertainty=lambda errors: 0 * errors["EX"] + 1e-9, head="x")
+        for _ in range(6)
+    )
+    (fine,) = blocks_of(Table("", long, over="angle"))  # +20000.000 ± 0.0020, six times
+    assert fine.wide
+
+
+def test_the_span_has_the_decimals_of_its_uncertainty():
+    (table,) = blocks_of(Spans())
+    by_name = {row[0]: [cell.text if isinstance(cell, Cell) else cell for cell in row] for row in table.rows}
+    # U of EA: 2 * 0.05 urad = 0.0206 arcsec; of EX 0.608 um.
+    assert (
+        by_name["EAC"] == ["EAC", "arcsec", "−2.063", "+2.063", "0.021", "0.021", "100 %"]
+        or by_name["EAC"][4] == "0.010"
+    )
+    assert by_name["EXC"][2:6] == ["−20.00", "+20.00", "0.61", "0.61"]
+    assert by_name["ECC"][2:6] == ["—"] * 4

@@ -4,7 +4,7 @@ Field units, intervals, reasons of missing values, translation, and the tables a
 method draws by hand only what is its own, and adds it by `Own`.
 """
 
-from errormotion.report.elements.chapter import Chapter, Element, Own, Section, Sentence
+from errormotion.report.elements.chapter import Chapter, Element, On, Own, Section, Sentence
 from errormotion.report.elements.drawings import Curves, Map, PolarPlot
 from errormotion.report.elements.figures import FigureBudget, FigureTable, KeyFigures
 from errormotion.report.elements.quantities import Of
@@ -35,6 +35,7 @@ __all__ = [
     "Map",
     "Notes",
     "Of",
+    "On",
     "Own",
     "PolarPlot",
     "Provenance",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -107,6 +107,25 @@ class Own:
     def blocks(self, source: Source, key: str) -> Sequence[Block]:
         """Return the blocks of the function."""
         return self.make(source, key)
+
+
+@dataclass(frozen=True)
+class On:
+    """Parts that read another dataset than the whole one: a selection, or one with further variables and attributes.
+
+    ``choose`` returns it; None where the parts do not apply, which leaves them out.
+    """
+
+    choose: Callable[[xr.Dataset], xr.Dataset | None]
+    parts: Sequence[Element]
+
+    def blocks(self, source: Source, key: str) -> list[Block]:
+        """Return the blocks of the parts for the chosen dataset."""
+        chosen_part = self.choose(source.errors)
+        if chosen_part is None:
+            return []
+        part = replace(source, errors=chosen_part)
+        return [block for k, each in enumerate(self.parts) for block in each.blocks(part, f"{key}-{k}")]
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from errormotion.report.elements.tables import filled
 from errormotion.report.text import listed, significant, signs
 
 _BANDS = "Bands: expanded uncertainty, k = 2."
+_SMOOTH = "Points and curves: values and smoothed values; bars and bands: expanded uncertainty, k = 2."
 _BARS = "Points and bars: values and expanded uncertainty, k = 2."
 
 
@@ -84,11 +85,14 @@ class Curves:
         scale, order = panels.sorted_along(ds, along)
         looks = panels.looks(ds, others, len(picks))
         smooth = _smoothed(ds, self.smooth, others)
+        columns = self.columns or (1 if len(found) == 1 else 2)
         own = _exact(ds, self.at, along, others, order, scale)
 
         def paint(axes: Axes, panel: list[Quantity]) -> None:
-            axes.set_title(panel[0].name if len(panel) == 1 else "")
-            axes.set_ylabel(panel[0].unit)
+            unit = panel[0].unit
+            title = panel[0].name if len(panel) == 1 else ""
+            axes.set_title(f"{title} / {unit}" if columns > 2 and unit else title)
+            axes.set_ylabel("" if columns > 2 else unit)
             if not any(np.isfinite(each.values.values.astype(float)).any() for each in panel):
                 panels.empty(axes)
                 return
@@ -121,14 +125,14 @@ class Curves:
         elif any(len(panel) > 1 for panel in found):
             widest = max(found, key=len)
             legend = [(each.name, panels.look(k)) for k, each in enumerate(widest)]
-        columns = self.columns or (1 if len(found) == 1 else 2)
+        tall = 1.7 if len(found) == 1 else 1.2 if columns < 3 else 1.42
         svg = panels.grid(
             [partial(paint, panel=panel) for panel in found], key, columns=columns,
-            tall=1.7 if len(found) == 1 else 1.2, down=columns == 2, label=scale.label, legend=legend,
+            tall=tall, down=columns == 2, label=scale.label, legend=legend,
         )  # fmt: skip
         caption = filled(self.caption.replace("{over}", along), ds)
         if self.band and any(each.u is not None for each in flat):
-            caption += f" {_BANDS if scale.joined and smooth is None else _BARS}"
+            caption += f" {_SMOOTH if smooth is not None else _BANDS if scale.joined else _BARS}"
         if others and len(picks) < int(known.sum()):
             caption += f" Shown: {len(picks)} of {int(known.sum())} curves over {listed(others)}."
         return [Figure(svg, caption, f"Curves over {along}: {panels.stated_spans(flat)}.")]
@@ -308,6 +312,7 @@ class Map:
             axes.set_title(f"{each.name} / {each.unit}" if each.unit else each.name)
             if first:
                 axes.set_ylabel(signs(y.label))
+                axes.yaxis.set_label_coords(*panels.beside(axes))
             values = (
                 np.asarray(each.values.transpose(self.y, self.x).values, dtype=float)[np.ix_(up, across)] / each.size
             )
@@ -400,9 +405,12 @@ def _exact(
 
 
 def _ticks(axes: Axes, scale: Scale) -> None:
-    """Label single objects with their names, as far as they fit, and angles at parts of a revolution."""
-    if scale.label.endswith(" / deg") and scale.values.size > 1 and np.ptp(scale.values) >= 60:
+    """Label single objects with their names, as far as they fit; angles and times at their usual parts."""
+    span = float(np.ptp(scale.values)) if scale.values.size else 0.0
+    if scale.label.endswith(" / deg") and span >= 60:
         axes.xaxis.set_major_locator(MaxNLocator(9, steps=[1, 1.5, 3, 4.5, 9, 10]))
+    elif scale.label.endswith(" / min") and span >= 60:
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 1.5, 2, 3, 6, 10]))
     if scale.texts:
         every = -(-len(scale.texts) // 12)
         axes.set_xticks(scale.values[::every], scale.texts[::every])

@@ -42,12 +42,15 @@ class KeyFigures:
     units : mapping of str to str
         Unit on the page by the SI unit, keys of `quantities.UNITS`; by default um and arcsec.
     note : str
-        Below each figure that has no limit.
+        Below each figure that has no limit; by default the place in its name, which follows " at ".
+    signed : bool
+        Whether a positive value has a plus sign.
     """
 
     names: Sequence[str] = ()
     units: Mapping[str, str] | None = None
     note: str = ""
+    signed: bool = False
 
     def key_figures(self, source: Source) -> list[KeyFigure]:
         """Return the figures for the head of the chapter."""
@@ -56,11 +59,12 @@ class KeyFigures:
         for each in stated[:_MOST] or largest(source):
             unit, size = unit_of(each.unit, (self.units or {}).get(each.unit, ""))
             limit = limit_of(source, each)
-            note = self.note if stated else "largest"
+            name, _, place = each.name.partition(" at ")
+            note = self.note or place if stated else "largest"
             if math.isfinite(limit):
                 note = f"limit {significant(limit / size, 3)} {unit}"
-            cell = estimate(each.value / size, each.expanded_uncertainty / size, signed=not stated)
-            found.append(KeyFigure(each.name, cell, unit, note, named=True))
+            cell = estimate(each.value / size, each.expanded_uncertainty / size, signed=self.signed or not stated)
+            found.append(KeyFigure(name, cell, unit, note, named=True))
         return found
 
     def sentences(self, source: Source) -> list[str]:

@@ -25,8 +25,8 @@ _LEFT, _BETWEEN, _END = 0.52, 0.5, 0.1
 _HEAD, _GAP, _FOOT, _LEGEND = 0.26, 0.3, 0.44, 0.2
 _LABEL = 0.17
 """Room for the label of an abscissa between two rows, inch."""
-_ENTRY = 7.0
-"""Width of a letter of a legend, points, with its handle."""
+_LETTER = 4.6
+"""Width of a letter of a legend, points."""
 
 
 def quantities(panel: Panel, ds: xr.Dataset) -> list[Quantity]:
@@ -125,7 +125,7 @@ def grid(
     rows = -(-len(paints) // columns)
     left, between = (_LEFT, _BETWEEN) if frames else (0.1, 0.15)
     wide = (canvas.WIDTH - left - (columns - 1) * between - _END - columns * right) / columns
-    each = max(1, int(72 * canvas.WIDTH / (_ENTRY * max((len(name) for name, _ in legend), default=1) + 30)))
+    each = max(1, int(72 * canvas.WIDTH / (_LETTER * max((len(name) for name, _ in legend), default=1) + 30)))
     lines = -(-len(legend) // each)
     foot = (_FOOT if label else 0.25 if frames else 0.08) + _LEGEND * lines
     gap = _GAP if frames else 0.32
@@ -153,6 +153,12 @@ def grid(
             )  # fmt: skip
 
     return canvas.draw(paint, key, high)
+
+
+def beside(axes: Axes) -> tuple[float, float]:
+    """Return the place of the label of an ordinate at the left edge of the drawing, in parts of the panel."""
+    wide = axes.get_position().width * axes.figure.get_figwidth()  # type: ignore[union-attr]
+    return -(_LEFT - 0.09) / wide, 0.5
 
 
 def empty(axes: Axes) -> None:

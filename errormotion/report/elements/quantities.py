@@ -96,7 +96,8 @@ class Of:
     unit : str
         A key of `UNITS`; by default the field unit: um, arcsec.
     select : mapping
-        Labels along dims that are selected, such as ``{"dof": "EX"}``.
+        Labels along dims that are selected, such as ``{"dof": "EX"}``; then the quantity has name and unit of this
+        freedom.
     """
 
     variable: str | Own
@@ -110,13 +111,14 @@ class Of:
         values = self._found(ds, self.variable)
         if values is None:
             return None
-        names = ds.em.iso_names() if freedom else {}
+        own = str(self.select.get("dof", ""))
+        names = ds.em.iso_names() if freedom or own else {}
         name = self.variable if isinstance(self.variable, str) else str(values.name)
         u = None
         if self.uncertainty != "none":
             u = self._spread(ds, values, name, freedom=freedom and not self.uncertainty)
-        si = str(values.attrs.get("units", "1"))
-        shown = names.get(name, name.replace("_", " "))
+        si = str(values.attrs.get("units", "1")) if not own else "m" if own in DOF[:3] else "rad"
+        shown = names.get(own or name, name.replace("_", " "))
         return Quantity(
             self._picked(values), None if u is None else self._picked(u), name, shown, *unit_of(si, self.unit)
         )

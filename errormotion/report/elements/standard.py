@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from errormotion.report.document import Block, Cell, Source, Text, or_dash
 from errormotion.report.elements.chapter import Section
 from errormotion.report.elements.quantities import FIELD, unit_of
 from errormotion.report.elements.tables import Column, Table
-from errormotion.report.text import finite, fixed, percent
+from errormotion.report.text import DASH, decimals_of, finite, fixed, percent, significant
 
 UNSEEN = "not observed by this method"
 WORDS = {"time": "instant"}
@@ -38,23 +38,38 @@ class Spans:
         for name in errors.em.names:
             unit, size = unit_of(str(errors[name].attrs.get("units", "1")))
             values, expanded = errors[name].values / size, u.sel(dof=name).values / size
-            ends = (
-                finite(np.min, values),
-                finite(np.max, values),
-                finite(np.median, expanded),
-                finite(np.max, expanded),
-            )
-            cells = [or_dash(fixed(value, 2, signed=j < 2), UNSEEN) for j, value in enumerate(ends)]
+            U = [finite(of, expanded) for of in (np.median, np.max)]
+            places = decimals_of(U[0], 2) if U[0] > 0 else 2
+            ends = [fixed(finite(of, values), places, signed=True) for of in (np.min, np.max)]
+            unstated = UNSEEN if ends[0] == DASH else "no uncertainty is stated for this value"
+            cells = [*(or_dash(end, UNSEEN) for end in ends), *(or_dash(significant(each), unstated) for each in U)]
             rows.append([names[name], unit, *cells, percent(float(np.isfinite(values).mean()))])
         head = ["error", "unit", "lowest", "highest", "U, median", "U, largest", "determined"]
         return [document.Table(self.caption, head, rows)]
 
 
+def last_place(errors: xr.Dataset) -> list[int]:
+    """Return the indices of the last place."""
+    return [errors.sizes[dim] - 1 for dim in errors.em.dims]
+
+
 @dataclass(frozen=True)
 class Budget:
-    """The uncertainty budget of the errors at one place: by default at the last one."""
+    """The uncertainty budget of the errors at one place.
 
-    at: Sequence[int] = ()
+    Attributes
+    ----------
+    at : callable
+        Returns the indices of the place along the dims of the errors, None for no budget; by default the last place.
+    place : callable
+        ``place(dataset, dims, index)``: the place in words; by default in field units.
+    noise : str
+        Name of the part that is independent from place to place.
+    """
+
+    at: Callable[[xr.Dataset], Sequence[int] | None] = last_place
+    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = place_of
+    noise: str = ""
 
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
         """Return the table; nothing if the dataset states no effects of sources."""
@@ -62,11 +77,16 @@ class Budget:
         if not {"influence", "deviation_influence"} & set(errors.data_vars):
             return []
         dims = errors.em.dims
-        index = [int(k) % errors.sizes[dim] for k, dim in zip(self.at or [-1] * len(dims), dims, strict=True)]
-        place = place_of(errors, dims, index)
-        along = " and ".join(WORDS.get(dim, dim) for dim in dims)
+        index = self.at(errors)
+        if index is None:
+            return []
+        place = self.place(errors, dims, index)
+        noise = self.noise
+        if dims and not noise:
+            along = " and ".join(WORDS.get(dim, dim) for dim in dims)
+            noise = f"noise, independent from {along} to {along}"
         here = errors.isel(dict(zip(dims, index, strict=True)))
-        return [budget.table(here, f"at {place}" if place else "", along=along)]
+        return [budget.table(here, f"at {place}" if place else "", noise or budget.readable("independent"))]
 
 
 @dataclass(frozen=True)

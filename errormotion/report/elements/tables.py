@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -99,7 +99,7 @@ class Table:
         `{name}` is replaced by an attribute of the dataset.
     columns : sequence of Column
     over : str or sequence of str
-        Dims of the rows; the first of several dims groups the rows.
+        Dims of the rows; the first of several dims groups the rows, unless it has a single place.
     head : str
         Name of the first column; by default that of the last dim.
     place : callable
@@ -108,8 +108,8 @@ class Table:
         Returns which rows are shown, a `DataArray` of bool over the dims of the rows.
     groups : sequence of (str, int)
         Second head: names over several columns, from the first column.
-    notes : sequence of str
-        Below the table.
+    notes : sequence of str or callable
+        Below the table; a function of the dataset returns several.
     absent : str
         A note in place of the table if there is nothing to show.
     """
@@ -121,7 +121,7 @@ class Table:
     place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = place_of
     where: Callable[[xr.Dataset], xr.DataArray] | None = None
     groups: Sequence[tuple[str, int]] = ()
-    notes: Sequence[str] = field(default=())
+    notes: Sequence[str | Callable[[xr.Dataset], Sequence[str]]] = ()
     absent: str = ""
 
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
@@ -142,16 +142,24 @@ class Table:
             return [Text(self.absent, "note")] if self.absent else []
         last = None
         for index in indices[:_MOST]:
-            if len(over) > 1 and index[0] != last:
+            if len(over) > 1 and shape[0] > 1 and index[0] != last:
                 last = index[0]
                 rows.append([self.place(ds, over[:1], index[:1])])
             own = slice(1, None) if len(over) > 1 else slice(None)
             name = self.place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
-            rows.append([name, *(column[tuple(index)] for column in made)])
+            rows.append([name, *_once([column[tuple(index)] for column in made])])
         heads = [column.title(each) for column, each in zip(self.columns, found, strict=True)]
         more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
-        caption = filled(self.caption, ds)
-        return [document.Table(caption, [self.head or over[-1], *heads], rows, self.groups, notes=[*self.notes, *more])]
+        notes = [note for each in self.notes for note in (each(ds) if callable(each) else [each])]
+        head = [self.head or over[-1], *heads]
+        return [document.Table(filled(self.caption, ds), head, rows, self.groups, notes=[*notes, *more])]
+
+
+def _once(cells: Sequence[Cell]) -> list[Cell]:
+    """Return the cells of a row; if all are dashes for one reason, the first one states it."""
+    if len({cell.reason for cell in cells}) == 1 and all(cell.text == DASH for cell in cells):
+        return [cells[0], *[Cell(DASH)] * (len(cells) - 1)]
+    return list(cells)
 
 
 def filled(template: str, ds: xr.Dataset) -> str:

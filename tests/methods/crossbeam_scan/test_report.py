@@ -429,7 +429,7 @@ def of_constants(small, tmp_path_factory):
 
 def test_freedom_that_is_never_observed_is_reported(of_constants):
     assert "Not observed by this test: EBY." in words_of(of_constants)
-    assert of_constants.count(">not determined<") == 3
+    assert of_constants.count(">not observed<") == 3
 
 
 def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(of_constants):

@@ -3,15 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import NO_REASON, Campaign, after, at_y, trimmed
+from errormotion.methods.crossbeam_scan.report.view import (
+    AXES,
+    NO_REASON,
+    Campaign,
+    after,
+    at_y,
+    campaign,
+    positions,
+    trimmed,
+)
+from errormotion.report import quality
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.document import Block, Cell, Table, Text, estimate, or_dash
-from errormotion.report.fields import field, remarks, unit_of
-from errormotion.report.text import DASH, finite, fixed, integer, listed, significant
+from errormotion.report.document import Block, Source, Text
+from errormotion.report.elements import Column, On, Table
+from errormotion.report.fields import field, remarks
+from errormotion.report.text import finite, fixed, integer, listed, significant
 
 _MAX_ROWS = 240  # of single registrations; if there are more, each cycle is one row
 _NOTE = (
@@ -20,8 +34,6 @@ _NOTE = (
     "standard uncertainties (k = 1) at the carriage, the worst of three directions, without pose and lever. "
     "1 arcsec = 4.848 µrad."
 )
-_HEAD = ("shift / nm", "rotation / µrad", "shift / nm", "rotation / µrad", "rms / µm", "points", "noise / µm")
-_JITTER = ("in z / µm", "in y / µm")
 _GROUPS = (("", 1), ("predicted", 2), ("by registration", 2), ("residual", 2), ("found", 1), ("line jitter", 2))
 
 
@@ -39,8 +51,9 @@ def lost(seen: Campaign) -> str:
     return ", ".join(f"{integer(kind.sum())} {words}" for kind, words in kinds if kind.any())
 
 
-def blocks(seen: Campaign) -> list[Block]:
-    """Return the method's remarks, the counts, and the table of registrations."""
+def counts(source: Source, key: str) -> list[Block]:  # noqa: ARG001 - texts have no identifiers
+    """Return the method's remarks and the counts."""
+    seen = campaign(source.errors)
     found: list[Block] = [Text(note, "warning") for note in remarks(seen.errors)]
     planned, done = made(seen)
     if not planned:
@@ -49,134 +62,175 @@ def blocks(seen: Campaign) -> list[Block]:
     if done < planned:
         words += f"; {lost(seen)}"
     found.append(Text(f"{words}.", "plain" if done == planned else "warning"))
-    if done and not np.isfinite(_numbers(seen)[seen.known]).any():
-        return [*found, Text("The result does not contain data on the quality of the registrations.", "note")]
-    found.append(_by_scan(seen) if planned <= _MAX_ROWS else _by_cycle(seen))
-    drift = _drift(seen)
-    return [*found, drift] if drift is not None else found
+    if done and not _stated(seen):
+        found.append(Text("The result does not contain data on the quality of the registrations.", "note"))
+    return found
 
 
-def _numbers(seen: Campaign) -> Array:
-    """Return the table's columns over (time, position, column) in their units; NaN where not known."""
-    columns: list[Array] = []
-    for name in ("predicted_u", "registration_u"):
-        sigma = seen.get(name, "dof")
-        worst = [
-            np.where(np.isfinite(part).any(-1), np.nan_to_num(part).max(-1), np.nan)
-            for part in (sigma[..., :3], sigma[..., 3:])
-        ]
-        columns += [1e9 * worst[0], 1e6 * worst[1]]
-    points = seen.get("points_used")
-    jitter = 1e6 * seen.get("line_jitter", "jitter")
-    return np.stack(
-        [*columns, 1e6 * seen.get("residual_rms"), points, 1e6 * seen.get("noise_found"), *_jitter(seen, jitter)],
-        axis=-1,
-    )
+_VARIABLES = (("predicted_u", "dof"), ("registration_u", "dof"), ("residual_rms",), ("points_used",), ("noise_found",))
 
 
-def _jitter(seen: Campaign, jitter: Array) -> tuple[Array, Array]:
-    """Return jitter in z and in y, (time, position) each."""
-    if jitter.shape[-1] != 2:
-        nothing = np.full(jitter.shape[:2], np.nan)
-        return nothing, nothing
-    labels = [str(label) for label in seen.errors["jitter"].values] if "jitter" in seen.errors.coords else ["z", "y"]
-    return jitter[..., labels.index("z") if "z" in labels else 0], jitter[
-        ..., labels.index("y") if "y" in labels else 1
-    ]
+def _stated(seen: Campaign) -> bool:
+    """Return whether the result states the quality of any registration."""
+    return any(np.isfinite(seen.get(*each)[seen.known]).any() for each in _VARIABLES)
 
 
-def _cells(numbers: Array, reason: str = "not part of this result") -> list[Cell | str]:
-    shift, turn, stated, stated_turn, rms, points, noise, jitter_z, jitter_y = numbers
-    words = [
-        _three(shift),
-        _three(turn),
-        _three(stated),
-        _three(stated_turn),
-        fixed(rms, 3),
-        integer(points),
-        fixed(noise, 3),
-        fixed(jitter_z, 2),
-        fixed(jitter_y, 2),
-    ]
-    return [or_dash(word, reason) for word in words]
+def _worst(name: str, rows: slice) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Return the largest standard uncertainty of three directions."""
+    return lambda errors: _all(errors, name, "dof").isel(dof=rows).max("dof").where(_made(errors))
+
+
+def _jitter(axis: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    def of(errors: xr.Dataset) -> xr.DataArray:
+        found = _all(errors, "line_jitter", "jitter")
+        labels = [str(label) for label in errors["jitter"].values] if "jitter" in errors.coords else ["z", "y"]
+        return found.isel(jitter=labels.index(axis)) if found.sizes["jitter"] == 2 else found.max("jitter") * np.nan
+
+    return of
+
+
+def _one(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    return lambda errors: _all(errors, name).where(_made(errors))
+
+
+def _all(errors: xr.Dataset, name: str, *dims: str) -> xr.DataArray:
+    return xr.DataArray(campaign(errors).get(name, *dims), dims=(*AXES, *dims))
+
+
+def _made(errors: xr.Dataset) -> xr.DataArray:
+    return xr.DataArray(campaign(errors).known, dims=AXES)
 
 
 def _three(value: float) -> str:
     return significant(value, 3) if value < 100 else integer(value)
 
 
-def _by_scan(seen: Campaign) -> Table:
-    numbers = _numbers(seen)
-    rows: list[list[Cell | str]] = []
-    for k in seen.warm:
-        rows.append([f"{after(seen.time[k])} of warm-up"])
-        for j in np.argsort(seen.position, kind="stable"):
-            name = at_y(seen.position[j])
-            if seen.known[k, j]:
-                rows.append([name, *_cells(numbers[k, j])])
-            else:
-                rows.append([name, Cell(DASH, reason=str(seen.reason[k, j])), *[DASH] * 8])
-    return Table(
-        "Quality of every registration, by warm-up time and position.",
-        ["artefact", *_HEAD, *_JITTER],
-        rows,
-        _GROUPS,
-        notes=[_NOTE],
+COLUMNS = tuple(
+    replace(column, uncertainty="none", reason="why", signed=False)
+    for column in (
+        Column(_worst("predicted_u", slice(0, 3)), head="shift", unit="nm", format=_three, reduce="highest"),
+        Column(_worst("predicted_u", slice(3, 6)), head="rotation", unit="urad", format=_three, reduce="highest"),
+        Column(_worst("registration_u", slice(0, 3)), head="shift", unit="nm", format=_three, reduce="highest"),
+        Column(_worst("registration_u", slice(3, 6)), head="rotation", unit="urad", format=_three, reduce="highest"),
+        Column(_one("residual_rms"), head="rms", unit="um", format=".3", reduce="highest"),
+        Column(_one("points_used"), head="points", format="integer", reduce="lowest"),
+        Column(_one("noise_found"), head="noise", unit="um", format=".3", reduce="highest"),
+        Column(_jitter("z"), head="in z", unit="um", format=".2", reduce="highest"),
+        Column(_jitter("y"), head="in y", unit="um", format=".2", reduce="highest"),
     )
+)
 
 
-def _by_cycle(seen: Campaign) -> Table:
-    numbers = _numbers(seen)
-    rows: list[list[Cell | str]] = []
-    for k in seen.warm:
-        each = numbers[k][seen.known[k]]
-        of_cycle = f"{after(seen.time[k])}: {len(each)} of {seen.position.size}"
-        if not len(each):
-            reasons = "; ".join(dict.fromkeys(seen.reason[k]))
-            rows.append([of_cycle, Cell(DASH, reason=reasons), *[DASH] * 8])
-            continue
-        worst = [finite(np.min if i == 5 else np.max, column) for i, column in enumerate(each.T)]
-        rows.append([of_cycle, *_cells(np.array(worst))])
-    holes = [(k, j) for k in seen.warm for j in range(seen.position.size) if not seen.known[k, j]]
-    by_reason: dict[str, list[str]] = {}
-    for k, j in holes:
-        by_reason.setdefault(str(seen.reason[k, j]), []).append(seen.where(k, j))
-    notes = [
-        f"{reason}: {'; '.join(positions[:6])}{' …' if len(positions) > 6 else ''}."
-        for reason, positions in by_reason.items()
+def _rows(single: bool) -> Callable[[xr.Dataset], xr.Dataset | None]:
+    """Return what selects the warm cycles, if their registrations are shown one by one or by cycles."""
+
+    def select(errors: xr.Dataset) -> xr.Dataset | None:
+        seen = campaign(errors)
+        planned, done = made(seen)
+        if not done or not _stated(seen) or (planned <= _MAX_ROWS) != single:
+            return None
+        found = errors.assign(why=(AXES, np.where(seen.known, "not part of this result", seen.reason)))
+        if not single:
+            reasons = [
+                "not part of this result" if known.any() else "; ".join(dict.fromkeys(map(str, reason)))
+                for known, reason in zip(seen.known, seen.reason, strict=True)
+            ]
+            found = found.assign(why=("time", reasons))
+        return found.isel(time=seen.warm, position=np.argsort(seen.position, kind="stable"))
+
+    return select
+
+
+def _row(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
+    """Return the cycle of a group of rows, or the artefact of a row."""
+    if dims[0] == "time":
+        return f"{after(float(errors['time'][index[0]]))} of warm-up"
+    return at_y(positions(errors)[index[0]])
+
+
+def _cycle(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:  # noqa: ARG001 - one dim
+    seen = campaign(errors)
+    return f"{after(seen.time[index[0]])}: {int(seen.known[index[0]].sum())} of {seen.position.size}"
+
+
+def _reasons(errors: xr.Dataset) -> list[str]:
+    """Return the registrations without a value, by reason."""
+    seen, by_reason = campaign(errors), dict[str, list[str]]()
+    for k, j in np.argwhere(~seen.known):
+        by_reason.setdefault(str(seen.reason[k, j]), []).append(seen.where(int(k), int(j)))
+    return [
+        f"{reason}: {'; '.join(places[:6])}{' …' if len(places) > 6 else ''}." for reason, places in by_reason.items()
     ]
-    return Table(
-        "Quality of the registrations: the worst of each cycle (of the points: the fewest), and how many were made.",
-        ["cycle", *_HEAD, *_JITTER],
-        rows,
-        _GROUPS,
-        notes=[_NOTE, *notes],
-    )
 
 
-def _drift(seen: Campaign) -> Text | None:
+TABLES = (
+    On(
+        _rows(single=True),
+        (
+            Table(
+                "Quality of every registration, by warm-up time and position.",
+                COLUMNS,
+                over=AXES,
+                head="artefact",
+                place=_row,
+                groups=_GROUPS,
+                notes=(_NOTE,),
+            ),
+        ),
+    ),
+    On(
+        _rows(single=False),
+        (
+            Table(
+                "Quality of the registrations: the worst of each cycle (of the points: the fewest), and how many were "
+                "made.",
+                COLUMNS,
+                over="time",
+                head="cycle",
+                place=_cycle,
+                groups=_GROUPS,
+                notes=(_NOTE, _reasons),
+            ),
+        ),
+    ),
+)
+
+
+def drift(source: Source, key: str) -> list[Block]:  # noqa: ARG001 - texts have no identifiers
+    """Return the drift during a scan, and what was counted during the measurement."""
+    seen, found = campaign(source.errors), list[Block]()
     strain = 1e6 * seen.get("strain", "direction")
-    if "strain" not in seen.errors or not np.isfinite(strain).any():
-        return None
-    largest = [finite(np.max, np.abs(strain[..., k])) for k in range(strain.shape[-1])]
-    words = listed([f"{trimmed(fixed(value, 1))} µm/m in {axis}" for value, axis in zip(largest, "xyz", strict=False)])
-    return Text(
-        "The error of the axis changes during a scan: a cold and a warm surface differ by more than a rigid motion. "
-        f"Drift of the profiler that was taken into account: at most {words}.",
-        "note",
-    )
+    if made(seen)[1] and "strain" in seen.errors and np.isfinite(strain).any():
+        largest = [finite(np.max, np.abs(strain[..., k])) for k in range(strain.shape[-1])]
+        each = zip(largest, "xyz", strict=False)
+        words = listed([f"{trimmed(fixed(value, 1))} µm/m in {axis}" for value, axis in each])
+        found.append(
+            Text(
+                "The error of the axis changes during a scan: a cold and a warm surface differ by more than a rigid "
+                f"motion. Drift of the profiler that was taken into account: at most {words}.",
+                "note",
+            )
+        )
+    counted = quality.counts(source.errors, source.raw)
+    if counted:
+        words = ", ".join(f"{name} {number}" for name, number in counted.items())
+        found.append(Text(f"Counted during the measurement: {words}."))
+    return found
 
 
-def stability(seen: Campaign) -> list[Block]:
-    """Return the result of the cold repeats and of the check for moved artefacts."""
-    found: list[Block] = [*_moved(seen)]
-    repeat = _repeats(seen)
-    if repeat is None:
+def stability(source: Source, key: str) -> list[Text]:  # noqa: ARG001 - texts have no identifiers
+    """Return the check for moved artefacts, and the assessment of the cold repeats."""
+    seen = campaign(source.errors)
+    found = _moved(seen)
+    repeats = _repeats(seen.errors)
+    if repeats is None:
         return [*found, Text("No cold repeat was scanned: the repeatability of the cold state is not known.", "note")]
-    return [*found, *repeat]
+    if not np.isfinite(repeats["cold_repeat"].values).any():
+        return [*found, Text("The cold repeat has no valid result.", "warning")]
+    return [*found, _assessment(seen)]
 
 
-def _moved(seen: Campaign) -> list[Block]:
+def _moved(seen: Campaign) -> list[Text]:
     if "moved" not in seen.errors or seen.errors["moved"].dims != ("position",):
         return [Text("The result does not state whether artefacts moved.", "note")]
     moved = np.nan_to_num(np.asarray(seen.errors["moved"].values, float)).astype(bool)
@@ -185,7 +239,7 @@ def _moved(seen: Campaign) -> list[Block]:
     since = np.full(moved.size, np.nan)
     if "moved_since" in seen.errors and seen.errors["moved_since"].dims == ("position",):
         since = np.asarray(seen.errors["moved_since"].values, float)
-    warnings: list[Block] = []
+    warnings: list[Text] = []
     for j in np.flatnonzero(moved):
         when = f" since the scan at {after(since[j])}" if math.isfinite(since[j]) else ""
         warnings.append(
@@ -198,41 +252,53 @@ def _moved(seen: Campaign) -> list[Block]:
     return warnings
 
 
-def _repeats(seen: Campaign) -> list[Block] | None:
-    errors = seen.errors
-    dims = ("repeat", "position", "dof")
-    if "cold_repeat" not in errors or set(errors["cold_repeat"].dims) != set(dims) or not errors["cold_repeat"].size:
+_REPEAT = ("repeat", "position", "dof")
+
+
+def _repeats(errors: xr.Dataset) -> xr.Dataset | None:
+    """Return a campaign whose artefacts were scanned cold again, with increasing positions; else None."""
+    if "cold_repeat" not in errors or set(errors["cold_repeat"].dims) != set(_REPEAT) or not errors["cold_repeat"].size:
         return None
-    values = field(errors, "cold_repeat", *dims)
-    sigma = field(errors, "cold_repeat_u", *dims) if "cold_repeat_u" in errors else np.full_like(values, np.nan)
-    if not np.isfinite(values).any():
-        return [Text("The cold repeat has no valid result.", "warning")]
-    rows: list[list[Cell | str]] = []
-    for r in range(values.shape[0]):
-        if values.shape[0] > 1:
-            rows.append([f"cold repeat {r + 1}"])
-        for j in np.argsort(seen.position, kind="stable"):
-            cells = []
-            for i in range(6):
-                size = unit_of(i)[1]
-                cells.append(
-                    estimate(
-                        values[r, j, i] / size, 2 * sigma[r, j, i] / size, reason="no cold repeat of this artefact"
-                    )
-                )
-            rows.append([at_y(seen.position[j]), *cells])
-    table = Table(
-        "Cold repeat: the six errors between two scans of the cold machine, which are zero if machine and artefacts "
-        "did not change. After ±: expanded uncertainty, k = 2.",
-        ["artefact", *(f"{seen.names[name]} / {unit_of(i)[0]}" for i, name in enumerate(FREEDOMS))],
-        rows,
-    )
-    return [_assessment(seen, values, sigma), table]
+    return errors.isel(position=np.argsort(campaign(errors).position, kind="stable"))
 
 
-def _assessment(seen: Campaign, values: Array, sigma: Array) -> Text:
-    expanded = np.where(sigma > 0, 2 * sigma, np.nan)
-    ratio = np.abs(values) / expanded
+def _known_repeats(errors: xr.Dataset) -> xr.Dataset | None:
+    found = _repeats(errors)
+    return found if found is not None and np.isfinite(found["cold_repeat"].values).any() else None
+
+
+def _repeated(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
+    if dims[0] == "repeat":
+        return f"cold repeat {index[0] + 1}"
+    return at_y(positions(errors)[index[0]])
+
+
+REPEATS = (
+    On(
+        _known_repeats,
+        (
+            Table(
+                "Cold repeat: the six errors between two scans of the cold machine, which are zero if machine and "
+                "artefacts did not change. After ±: expanded uncertainty, k = 2.",
+                tuple(
+                    Column("cold_repeat", select={"dof": name}, reason="no cold repeat of this artefact")
+                    for name in FREEDOMS
+                ),
+                over=("repeat", "position"),
+                head="artefact",
+                place=_repeated,
+            ),
+        ),
+    ),
+)
+
+
+def _assessment(seen: Campaign) -> Text:
+    values = field(seen.errors, "cold_repeat", *_REPEAT)
+    sigma: Array = np.full_like(values, np.nan)
+    if "cold_repeat_u" in seen.errors:
+        sigma = field(seen.errors, "cold_repeat_u", *_REPEAT)
+    ratio = np.abs(values) / np.where(sigma > 0, 2 * sigma, np.nan)
     judged = np.isfinite(ratio)
     if not judged.any():
         return Text("The cold repeat has no stated uncertainty: it cannot be assessed.", "note")

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y
+from errormotion.methods.crossbeam_scan.report.view import Campaign, after, at_y, campaign
 from errormotion.report import canvas
 from errormotion.report.budget import FREEDOMS
-from errormotion.report.document import Block, Figure, Text
+from errormotion.report.document import Block, Figure, Source, Text
 from errormotion.report.drawings import maps as crossbeam_maps
 from errormotion.report.fields import field
 from errormotion.report.text import finite, fixed, integer, significant
@@ -22,8 +22,9 @@ _MAPS = ("difference_before", "difference_after")
 _FINEST = 48  # cells a side
 
 
-def blocks(seen: Campaign, key: str) -> list[Block]:
+def blocks(source: Source, key: str) -> list[Block]:
     """Return figure and text of the last registration of the artefact with the largest error."""
+    seen = campaign(source.errors)
     shown = seen.shown()
     if shown is None:
         return [Text("No scan could be registered.", "warning")]

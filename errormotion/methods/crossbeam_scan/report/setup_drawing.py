@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.methods.crossbeam_scan.report import pose as crossbeam_pose
-from errormotion.methods.crossbeam_scan.report.view import Campaign, millimetres
+from errormotion.methods.crossbeam_scan.report.view import Campaign, campaign, millimetres
 from errormotion.report import canvas
 from errormotion.report.canvas import BLUE, GREEN, PURPLE, VERMILLION
-from errormotion.report.document import Block, Cell, Figure, Text
+from errormotion.report.document import Block, Cell, Figure, Source, Text
 from errormotion.report.text import fixed
 
 _OVERHANG = 0.25  # of the beam drawn beyond the first and the last artefact, m
@@ -63,8 +63,9 @@ def setup_of(seen: Campaign) -> Setup | None:
     return Setup(lever, profiler, below, patch)
 
 
-def blocks(seen: Campaign, key: str) -> list[Block]:
+def blocks(source: Source, key: str) -> list[Block]:
     """Return drawing and tables of the set-up, or a text where they are unknown."""
+    seen = campaign(source.errors)
     setup, tables = setup_of(seen), _tables(seen)
     if setup is None:
         return [Text("The result does not contain the lever: the set-up cannot be drawn.", "note"), *tables]

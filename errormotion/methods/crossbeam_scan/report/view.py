@@ -146,10 +146,11 @@ def campaign(errors: xr.Dataset) -> Campaign:
     zero = np.nan_to_num(values) == 0
     reference = (zero & (np.nan_to_num(sigma) == 0)).all(axis=(1, 2)) & (time <= 0)
     scan_time = np.where(reference[:, None], time[:, None], scan_time)  # the cold scan is at time 0
-    return Campaign(errors, time, _positions(errors), scan_time, values, sigma, _reasons(errors, values), reference)
+    return Campaign(errors, time, positions(errors), scan_time, values, sigma, _reasons(errors, values), reference)
 
 
-def _positions(errors: xr.Dataset) -> Array:
+def positions(errors: xr.Dataset) -> Array:
+    """Return the position of the axis over each artefact, m."""
     for name in (str(errors.attrs.get("component", "")).lower(), "y", "position"):
         if name in errors.coords and errors[name].dims == ("position",) and errors[name].dtype.kind in "iuf":
             return np.asarray(errors[name].values, float)
