@@ -309,11 +309,9 @@ def _refuse_other(path: Path, data: Mapping[str, Any], expected: str) -> None:
 def _missing(campaign: CampaignPlan) -> Iterator[str]:
     """Yield the errors that methods find in their settings, such as missing files."""
     for number, test in enumerate(campaign.tests):
-        check = getattr(test.method, "check", None)
-        if check is not None:
-            with looking_beside(campaign.folder):
-                found = check(test.method(), test.settings)
-            yield from (f"{tomlfile.dotted(('test', number, 'settings', key))}: {text}" for key, text in found.items())
+        with looking_beside(campaign.folder):
+            found = test.method().check(test.settings)
+        yield from (f"{tomlfile.dotted(('test', number, 'settings', key))}: {text}" for key, text in found.items())
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
@@ -509,7 +507,7 @@ def _limit_mistakes(method: str, settings: Any, bench: BenchPlan, place: tuple[s
         steps = steps_of(plugins.get("methods", method), settings, bench.settings_by_kind)
     except MethodError as error:
         return [f"{where}: {error}"]
-    if steps is None and hasattr(plugins.get("methods", method), "programs"):
+    if steps is None and plugins.states(plugins.get("methods", method), "programs"):
         return [f"{where}: {NO_MOTIONS.format(method)}, although it writes NC programs"]
     broken = violations(extent(steps), bench.limits) if steps else []
     tables = "[limits]" if bench.description is None else "[limits] and [machine]"
@@ -541,7 +539,7 @@ def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]
         method = plugins.get("methods", test.method)
     except PluginError:
         return []  # reported with its settings
-    if hasattr(method, "redrawing"):
+    if plugins.states(method, "redrawing"):
         return []
     return [f"{where}: the method '{test.method}' does not support the Monte Carlo evaluation (it has no 'redrawing')"]
 

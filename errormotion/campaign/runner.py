@@ -389,8 +389,7 @@ class _Session:
         bench.set_limits(forbidden(self.campaign, test))
         recorder = Recorder(folder.raw, dim, expected, attrs)
         taken = before
-        follow = getattr(method, "follow", None) if self.progress.shown else None
-        note = follow(test.settings) if follow else None
+        note = method.follow(test.settings) if self.progress.shown else None
         try:
             with (
                 _in_order(),

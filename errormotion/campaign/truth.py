@@ -36,12 +36,12 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     if folder.errors is None:
         raise RunError(f"{folder.path}: the run has no error dataset yet; identify its raw data first")
     method = plugins.get("methods", str(folder.data["method"]["id"]))
-    truth = getattr(method, "truth", None)
     with datasets.load(folder.errors) as errors:
-        if truth is None or errors.attrs["component"] == "beam":
-            raise RunError(f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}")
         start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
-        found: xr.Dataset = truth(machine, errors, between(clock["start"], start))
+        stated = errors.attrs["component"] != "beam" and plugins.states(method, "truth")
+        found: xr.Dataset | None = method().truth(machine, errors, between(clock["start"], start)) if stated else None
+        if found is None:
+            raise RunError(f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}")
         found = found.assign_attrs(
             {key: errors.attrs[key] for key in ("machine", "frame", "lever_axes") if key in errors.attrs}, start=start
         )

@@ -242,7 +242,7 @@ CARRIED = ("chain", "operator", "certificates", "straightness_reference")
 def variants(schema: str) -> tuple[RawSchema, ...]:
     """Return the raw schemas of one id, from the plugin that provides them; none for an unknown id."""
     owner = plugins.owner_of_schema(schema)
-    return tuple(table for table in getattr(owner, "raw_schemas", ()) if table.id == schema)
+    return () if owner is None else tuple(table for table in owner.raw_schemas if table.id == schema)
 
 
 def raw_schemas() -> tuple[RawSchema, ...]:
@@ -254,7 +254,7 @@ def raw_schemas() -> tuple[RawSchema, ...]:
 def known_schemas() -> set[str]:
     """Return the ids of all known schemas."""
     known = {SCHEMA} | {table.id for table in raw_schemas()}
-    return known.union(*(getattr(cls.info, "schemas", ()) for cls in plugins.loaded("datasets")))
+    return known.union(*(cls.info.schemas for cls in plugins.loaded("datasets")))
 
 
 __all__ = [

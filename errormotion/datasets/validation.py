@@ -86,7 +86,7 @@ def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
     """
     schema = method.needs.raw_schema
     checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=schema)
-    validate(checked, tuple(getattr(method, "raw_schemas", ())))
+    validate(checked, tuple(method.raw_schemas))
     if checked.attrs["schema"] != schema:
         raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {checked.attrs['schema']}.")
     return checked

@@ -10,14 +10,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.errors import MethodError
-from errormotion.plugins import MethodInfo, Needs, PluginSettings
+from errormotion.plugins import Method
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping
 
     import xarray as xr
 
-    from errormotion.datasets.schemas import RawSchema
     from errormotion.estimation.datum import Relative
     from errormotion.estimation.fit import Fit
     from errormotion.measurement.observed import Observed
@@ -26,13 +25,9 @@ if TYPE_CHECKING:
 __all__ = ["ModelMethod"]
 
 
-class ModelMethod:
+class ModelMethod(Method):
     """A method with a measurement model; without ``acquire`` it evaluates imported data only."""
 
-    info: ClassVar[MethodInfo]
-    needs: ClassVar[Needs]
-    Settings: ClassVar[type[PluginSettings]]
-    raw_schemas: ClassVar[Sequence[RawSchema]]
     grows: ClassVar[str] = "time"
     """The dim along which the parts of an acquisition are joined."""
 

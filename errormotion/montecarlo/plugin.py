@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from errormotion.plugins import DatasetInfo, lazy
+from errormotion.plugins import DatasetInfo, DatasetPlugin, lazy
 
 
-class MonteCarloDataset:
+class MonteCarloDataset(DatasetPlugin):
     """Monte Carlo evaluations of error datasets."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(

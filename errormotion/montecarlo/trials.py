@@ -11,7 +11,7 @@ from numpy.random import SeedSequence
 
 from errormotion.arrays import Array
 from errormotion.errors import ErrormotionError, MethodError
-from errormotion.plugins import Redrawing
+from errormotion.plugins import Redrawing, states
 
 MAX_DIFFERENCE = 1e-2
 """Largest difference between the results of reduced and measured data, in standard uncertainties."""
@@ -27,12 +27,12 @@ def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset
     MethodError
         The method has no redrawing, or the result of its reduced data is not that of the measured data.
     """
-    if not hasattr(method, "redrawing"):
+    found: Redrawing | None = method.redrawing(raw, settings, errors) if states(method, "redrawing") else None
+    if found is None:
         raise MethodError(
             f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it has "
             "no 'redrawing'. Its linear uncertainty is not affected."
         )
-    found: Redrawing = method.redrawing(raw, settings, errors)
     check_centre((found.identify or method.identify)(found.raw, found.settings), errors)
     return found
 

@@ -1,10 +1,11 @@
 """Plugins: the contracts of instruments, methods, kinds of dataset and compensators, and the registry.
 
-A plugin is a plain class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods``,
+A plugin is a class, named in the entry-point group ``errormotion.instruments``, ``errormotion.methods``,
 ``errormotion.datasets`` or ``errormotion.compensators`` of any distribution. The built-in plugins are registered in
 the same way.
 """
 
+from errormotion.plugins.base import DatasetPlugin, Method, Owner, states
 from errormotion.plugins.commanding import unarmed
 from errormotion.plugins.contracts import (
     ERRORS_SCHEMA,
@@ -19,7 +20,6 @@ from errormotion.plugins.contracts import (
     Instrument,
     InstrumentInfo,
     MachineLimits,
-    Method,
     MethodInfo,
     Needs,
     PluginSettings,
@@ -56,6 +56,7 @@ __all__ = [
     "CompensatorSubject",
     "Contact",
     "DatasetInfo",
+    "DatasetPlugin",
     "Environment",
     "FigureOfMerit",
     "FrameGeometry",
@@ -70,6 +71,7 @@ __all__ = [
     "MethodInfo",
     "MethodSubject",
     "Needs",
+    "Owner",
     "Plugin",
     "PluginSettings",
     "Profiles",
@@ -91,5 +93,6 @@ __all__ = [
     "owner_of_schema",
     "refresh",
     "replaced",
+    "states",
     "unarmed",
 ]

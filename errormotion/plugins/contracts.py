@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, runtime_checkable
@@ -373,99 +373,3 @@ class Compensator(Protocol):
         Raises InstrumentError, and sends nothing, if it is not armed or the values are not three finite numbers
         within the limit.
         """
-
-
-@runtime_checkable
-class Method(Protocol):
-    """A method: acquisition of raw data, and their identification as an error dataset.
-
-    Optional attributes; `lazy` loads one at its first use, if its import takes long.
-
-    ``raw_schemas`` : tuple of `errormotion.datasets.schemas.RawSchema`
-        The tables for validation, CSV reading, import and the reference pages.
-    ``texts(language)`` : mapping of str to str
-        Catalogue of the texts of its chapters: English to this language (``de``).
-    ``chapters(source)`` : list of `errormotion.report.document.Part`
-        The report of one of its error datasets; by default the generic chapter.
-    ``figures(errors)`` : list of `FigureOfMerit`
-        The numbers for the command line and summaries.
-    ``simulate(settings, seed)`` : (raw, truth)
-        Raw data with known truth: a raw dataset, and an error dataset relative to the same reference.
-    ``truth(machine, errors, clock)`` : Dataset
-        The true errors of a `VirtualMachine` at the positions and times of an error dataset, whose time 0 is at
-        ``clock`` (s) of the machine.
-    ``conformance()`` : tuple of `MethodSubject`
-        The subjects of the conformance kit.
-    ``follow(settings)`` : function
-        Called with each acquired dataset; returns a line of text for the operator.
-    ``programs(settings, instruments)`` : mapping of str to str
-        The NC programs of the test: file name to text.
-    ``motions(settings, instruments)`` : list of `Step`
-        All steps of the machine; checked against the limits of the bench before the first motion. Required for a
-        method that moves a machine, by a controller or by programs: without it, no motion is allowed in its tests. The
-        steps include the ends of a search. Raises MethodError if the settings do not determine the steps.
-    ``planning_settings(settings, instruments)`` : settings
-        Settings of ``plan`` for a test of a campaign: the settings, completed with data of the instruments of the
-        bench, such as their noise.
-    ``check(settings)`` : mapping of str to str
-        Mistakes that can be found before a measurement, by setting; called when a campaign is read.
-
-    ``machine_defaults(machine)`` : mapping of str to value
-        Defaults of settings that follow from the machine of the bench (a `MachineDescription`).
-    ``check_machine(settings, machine)`` : mapping of str to str
-        Contradictions to the machine, by setting (an empty text for all settings), with the expected and the found
-        value; called when a campaign is read.
-    ``check_bench(settings, bench, inputs)`` : list of str
-        Why a test cannot be measured with these instruments: one that it commands is not armed (`unarmed`) or cannot be
-        commanded, a channel does not exist, an input is missing. It may raise MethodError or BenchError instead. Called
-        before anything is opened or created; the drivers of ``bench`` are not open, ``inputs`` are the names of the
-        inputs of the test. Without it, a test with motions needs one armed instrument, if the bench has any that moves
-        a machine.
-    ``cannot_continue(settings)`` : str
-        Why an interrupted measurement cannot be continued, such as an axis that has cooled down; empty if it can.
-    ``redrawing(raw, settings, errors)`` : `Redrawing`
-        The sources of uncertainty of raw data, for ``identify --monte-carlo``; ``errors`` is the result of
-        ``identify``.
-    ``doctor`` : mapping of str to function
-        Checks of this computer for ``errormotion doctor``; each returns a text or raises an error. Also possible for
-        instruments.
-
-    ``calibrations`` : mapping of str to `Calibration`
-        Raw schema of readings to the calibration that ``errormotion calibrate`` computes from them.
-    ``log_readers`` : mapping of str to function
-        Formats of maps of this method for ``errormotion import``: value of the key ``schema`` of the map to a function
-        ``(log, map)`` of two paths that returns the raw dataset. A map whose key ``schema`` is a raw schema needs no
-        function.
-
-    The argument ``instruments`` contains the settings of the instruments of the bench by kind.
-    """
-
-    info: ClassVar[MethodInfo]
-    needs: ClassVar[Needs]
-    Settings: ClassVar[type[PluginSettings]]
-
-    def acquire(
-        self,
-        bench: Bench,
-        settings: Any,
-        *,
-        inputs: Mapping[str, xr.Dataset],
-        done: xr.Dataset | None = None,
-    ) -> Iterator[xr.Dataset]:
-        """Measure; yield raw datasets, which are joined along ``append_dim(settings)``.
-
-        ``inputs`` are results of earlier tests by their names in the campaign. ``done`` contains the data of an
-        interrupted run, which is continued.
-        """
-
-    def append_dim(self, settings: Any) -> str:
-        """Return the dimension along which the yielded datasets are joined."""
-
-    def progress(self, settings: Any) -> float:
-        """Return the expected total for the progress bar: seconds for chunks with ``sample_rate``, else items."""
-
-    def identify(self, raw: xr.Dataset, settings: Any) -> xr.Dataset:
-        """Return the error dataset of a raw dataset, which is not changed."""
-
-    def plan(self, settings: Any) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance."""

@@ -25,12 +25,15 @@ def load_object(path: str) -> Any:
         raise PluginError(f"'{path}' does not load: {type(error).__name__}: {error}") from error
 
 
-class lazy:  # noqa: N801 - reads like `property` and `cached_property`
-    """A class attribute that is imported at its first use: ``chapters = lazy("my_lab.report:chapters")``.
+def lazy(path: str) -> Any:
+    """Return a class attribute that is imported at its first use: ``chapters = lazy("my_lab.report:chapters")``.
 
     A function is not bound to the instance.
     """
+    return _Lazy(path)
 
+
+class _Lazy:
     def __init__(self, path: str) -> None:
         self.path = path
 

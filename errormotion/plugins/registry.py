@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from errormotion.errors import PluginError, PluginWarning
 from errormotion.plugins import kind_registry
+from errormotion.plugins.base import DatasetPlugin, Method, adapted, states
 from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInfo
 
 Group = Literal["instruments", "methods", "datasets", "compensators"]
@@ -48,6 +49,11 @@ _REQUIRED: Mapping[Group, tuple[type[InstrumentInfo | MethodInfo | DatasetInfo],
     "datasets": (DatasetInfo, ()),
     "compensators": (InstrumentInfo, ("Settings", "open", "close", "identify", "arm", "read", "write")),
 }
+
+
+def _has(cls: Any, name: str) -> bool:
+    """Return whether a class states a required part, which its base class only declares."""
+    return hasattr(cls, name) and (not hasattr(Method, name) or states(cls, name))
 
 
 def _name_and_version(dist: Distribution | None) -> str:
@@ -108,8 +114,9 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
         info = getattr(cls, "info", None)
         if not isinstance(info, kind):
             raise PluginError(f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}")
-        if missing := [name for name in required if not hasattr(cls, name)]:
+        if missing := [name for name in required if not _has(cls, name)]:
             raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
+        cls = adapted(cls, group)
         if info.id != point.name:
             raise PluginError(f"the entry point is called '{point.name}', but the id of the class is '{info.id}'")
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
@@ -178,7 +185,7 @@ def brought(name: str, *groups: Group) -> Iterator[tuple[Any, Any]]:
     """
     for cls in loaded(*groups):
         value = _attribute(cls, name)
-        if value is not None:
+        if value:
             yield cls, value
 
 
@@ -212,7 +219,7 @@ def owner_of_schema(schema: str) -> Any:
 def owner_of_method(method: str) -> Any:
     """Return the plugin class whose error datasets have this attribute ``method``; None if there is none."""
     for cls in _named_first(method, ("methods", "datasets")):
-        if method == cls.info.id or method in getattr(cls.info, "methods", ()):
+        if method == cls.info.id or (issubclass(cls, DatasetPlugin) and method in cls.info.methods):
             return cls
     return None
 
@@ -228,9 +235,7 @@ def _named_first(name: str, groups: tuple[Group, ...]) -> Iterator[Any]:
 
 
 def _schemas_of(cls: Any) -> set[str]:
-    own = set(getattr(cls.info, "schemas", ()))
-    if hasattr(cls, "needs"):
-        own.add(cls.needs.raw_schema)
+    own = set(cls.info.schemas) if issubclass(cls, DatasetPlugin) else {cls.needs.raw_schema}
     return own | {getattr(table, "id", "") for table in _attribute(cls, "raw_schemas") or ()}
 
 

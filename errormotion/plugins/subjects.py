@@ -14,6 +14,7 @@ from urllib.parse import urlsplit, urlunsplit
 import xarray as xr
 
 from errormotion.plugins import kind_registry
+from errormotion.plugins.base import adapted
 from errormotion.plugins.lazy import load_object
 
 #: Transformation of a variable of a raw dataset with the frame: see ``MethodSubject.raw_vectors``.
@@ -247,6 +248,9 @@ class MethodSubject:
     motion: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.3, -0.2, 0.5), (0.1, -0.2, 0.05))
     seeds: int | None = None
     compiles: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "plugin", adapted(self.plugin, "methods"))
 
     def __hash__(self) -> int:
         return id(self)

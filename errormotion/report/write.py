@@ -158,7 +158,7 @@ def _finished(found: Page, out: Path, form: Form, head: Head) -> Path:
 def catalogue_of(source: Source, language: str) -> Mapping[str, str]:
     """Return the catalogue of the plugin that made a dataset; empty if it has none."""
     owner = _owner(source.errors)
-    return owner.texts(language) if language and hasattr(owner, "texts") else {}
+    return owner().texts(language) if language and owner is not None else {}
 
 
 def _limits(tolerances: Tolerances | None) -> dict[str, tuple[float, float]]:
@@ -189,7 +189,7 @@ def chapters(source: Source) -> list[Part]:
     """Return the chapters of one dataset: those of the plugin that made it, else the generic one."""
     owner = _owner(source.errors)
     try:
-        own = list(owner.chapters(source)) if hasattr(owner, "chapters") else []
+        own = [] if owner is None else list(owner().chapters(source))
         if own:
             return own
         return [COMPONENTS.get(str(source.errors.attrs.get("component")), generic.part)(source, source.key)]
@@ -261,20 +261,24 @@ def _owner(dataset: xr.Dataset) -> Any:
 def _is_log(dataset: xr.Dataset) -> bool:
     """Return whether a dataset without errors has its own chapters, such as a log; raw data of a method have none."""
     owner = _owner(dataset)
-    return isinstance(getattr(owner, "info", None), plugins.DatasetInfo) and hasattr(owner, "chapters")
+    return _is_dataset_plugin(owner) and plugins.states(owner, "chapters")
+
+
+def _is_dataset_plugin(owner: Any) -> bool:
+    return owner is not None and issubclass(owner, plugins.DatasetPlugin)
 
 
 def _kind_without_errors(dataset: xr.Dataset) -> str:
     """Return the kind of a dataset without report, and the command for it; empty for others."""
     owner = plugins.owner_of_schema(str(dataset.attrs.get("schema")))
-    if not isinstance(getattr(owner, "info", None), plugins.DatasetInfo):
+    if not _is_dataset_plugin(owner):
         return ""
-    if hasattr(owner, "predictor"):
+    if plugins.states(owner, "predictor"):
         return (
             "a model, which contains no errors. Compare it with a measured campaign: errormotion model check MODEL "
             "ERRORS --report page.html; or predict errors and report these: errormotion model predict MODEL DATA"
         )
-    if hasattr(owner, "chapters"):
+    if plugins.states(owner, "chapters"):
         return ""
     return f"another kind of data: {owner.info.summary.rstrip('.')} ({dataset.attrs['schema']})"
 

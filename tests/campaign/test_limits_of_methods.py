@@ -87,12 +87,12 @@ def test_no_command_accepts_it(campaign: Path, command: list[str]) -> None:
 METHOD = """
 import numpy as np
 import xarray as xr
-from errormotion.plugins import MethodInfo, Needs, PluginSettings, Step
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, Step
 
 class Settings(PluginSettings):
     pass
 
-class Wanderer:
+class Wanderer(Method):
     info = MethodInfo("wanderer", "a method that moves the machine", "simulated_only")
     needs = Needs(("controller",), "errormotion.raw.wanderer/1")
     Settings = Settings

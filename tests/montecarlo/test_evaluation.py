@@ -19,7 +19,7 @@ from errormotion.montecarlo.places import PLACES, chosen_places
 from errormotion.montecarlo.report import chapters, texts
 from errormotion.montecarlo.result import SCHEMA, lines
 from errormotion.montecarlo.store import Store
-from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.report.document import Source
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -50,7 +50,7 @@ def _shifted(raw: xr.Dataset, by) -> xr.Dataset:
     return found
 
 
-class Straight:
+class Straight(Method):
     """Displacement along X and Y at three times; readings have noise and a common offset of the sensor."""
 
     info = MethodInfo("straight", "A method that exists in this test only", "simulated_only")
@@ -212,7 +212,7 @@ def test_invalid_options_are_an_error(measured, tmp_path, options, message):
 def test_a_method_without_redrawing_is_refused(measured):
     _, method, settings, errors = measured
 
-    class Plain:
+    class Plain(Method):
         info = method.info
 
     with pytest.raises(MethodError, match="has no 'redrawing'"):
@@ -236,7 +236,7 @@ def test_an_omitted_source_does_not_change_the_samples_of_the_others():
     def adds(raw, settings, generator):
         return [*raw, generator.normal()], settings
 
-    class Lists:
+    class Lists(Method):
         def identify(self, raw, settings):
             return raw
 

@@ -147,9 +147,9 @@ def test_a_newly_installed_plugin_is_found_after_a_refresh(install, tmp_path):
 
 
 DATASET = """
-from errormotion.plugins import DatasetInfo, lazy
+from errormotion.plugins import DatasetInfo, DatasetPlugin, lazy
 
-class Kind:
+class Kind(DatasetPlugin):
     info = DatasetInfo("broken", "A kind of dataset with a part that does not load", ("lab.broken/1",))
     raw_schemas = {tables}
     log_readers = lazy("wreck_readers:READERS")
@@ -170,3 +170,37 @@ def test_tables_that_are_not_schemas_are_ignored(install):
     install("wreck", "[errormotion.datasets]\nbroken = wreck:Kind\n", DATASET.format(tables="(1, 'text')"))
     assert {"errormotion.errors/1", "errormotion.raw.spindle_drift/1"} <= schemas.known_schemas()
     assert plugins.owner_of_schema("lab.unknown/1") is None
+
+
+METHOD = """
+from errormotion.plugins import {imported}MethodInfo, Needs, PluginSettings
+
+class Old{base}:
+    info = MethodInfo("old", "A method", "simulated_only")
+    needs = Needs((), "lab.raw.old/1")
+    Settings = PluginSettings
+    def acquire(self, bench, settings, *, inputs, done=None): ...
+    def append_dim(self, settings): return "time"
+    def progress(self, settings): return 1.0
+    def identify(self, raw, settings): return raw
+    def programs(self, settings, instruments): return {{"a.nc": "M2"}}
+"""
+PLAN = "    def plan(self, settings): return settings\n"
+
+
+def test_a_method_of_the_old_form_has_the_optional_parts_and_a_warning(install):
+    install("old", "[errormotion.methods]\nold = old:Old\n", METHOD.format(imported="", base="") + PLAN)
+    with pytest.warns(PluginWarning, match=r"'old' does not extend errormotion.plugins.Method; from version 0.3"):
+        old = plugins.get("methods", "old")
+    assert issubclass(old, plugins.Method)
+    assert old().motions(None, {}) is None
+    assert old().planning_settings("its", {}) == "its"
+    assert [plugins.states(old, name) for name in ("programs", "motions", "figures")] == [True, False, False]
+
+
+def test_parts_that_the_base_class_only_declares_are_required(install):
+    install("new", "[errormotion.methods]\nold = new:Old\n", METHOD.format(imported="Method, ", base="(Method)"))
+    with pytest.raises(PluginError, match="class Old lacks plan"):
+        plugins.get("methods", "old")
+    with pytest.raises(AttributeError, match="plugins have no part 'motion'"):
+        plugins.states(plugins.Method, "motion")

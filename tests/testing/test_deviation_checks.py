@@ -6,7 +6,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.plugins import MethodInfo, MethodSubject, Needs, PluginSettings
+from errormotion.plugins import Method, MethodInfo, MethodSubject, Needs, PluginSettings
 from errormotion.testing import run_checks
 
 SCHEMA = "errormotion.raw.one_sensor/1"
@@ -15,7 +15,7 @@ TIME = 60.0 * np.arange(12)
 FEATURES = {"component": "tool", "machine": "none", "frame": "machine", "reference": "time 0"}
 
 
-class Sound:
+class Sound(Method):
     """One sensor measures a body along its beam."""
 
     info = MethodInfo("one_sensor", "A method that exists in this test only", "simulated_only", cannot_see=("most",))
@@ -146,7 +146,7 @@ def test_the_report_of_any_method_shows_a_deviation(tmp_path):
 
     errors = Sound().identify(make(0)[0], None)
     page = write_report(errors, tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "Observed: deviation, at 12 (time)." in page
+    assert "Observed: deviation, at 12 times." in page
     assert "measured along one known direction only" in page
     assert "standard uncertainty (k = 1) of the deviation, by group of sources" in page
     assert page.count("<svg") == 1

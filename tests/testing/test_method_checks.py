@@ -13,7 +13,7 @@ from errormotion import datasets
 from errormotion.datasets.results.merit import last_values
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.plugins import MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, Redraw, Redrawing
 from errormotion.report.document import Part
 from errormotion.testing import MethodConformance, MethodSubject, run_checks
 from errormotion.testing.checks.method import METHOD_CHECKS
@@ -30,7 +30,7 @@ class Settings(PluginSettings):
     noise: float = NOISE
 
 
-class Sound:
+class Sound(Method):
     """Eight sensors measure a body from known positions; its six freedoms follow by least squares."""
 
     info = MethodInfo("body", "A method that exists in this test only", "simulated_only", cannot_see=("its shape",))

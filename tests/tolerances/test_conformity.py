@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion import datasets, plugins
 from errormotion.datasets import provenance
 from errormotion.errors import BenchError
-from errormotion.plugins import FigureOfMerit
+from errormotion.plugins import FigureOfMerit, Method
 from errormotion.report import write_report
 from errormotion.tolerances.conformity import judge, matches
 from errormotion.tolerances.decision import INSIDE, OPEN, OUTSIDE
@@ -47,7 +47,7 @@ def errors() -> xr.Dataset:
     )
 
 
-class Foreign:
+class Foreign(Method):
     """The method of another distribution."""
 
     @staticmethod
@@ -173,7 +173,7 @@ def test_the_least_share_of_known_points_is_a_setting(tmp_path: Path, errors: xr
 def test_a_value_without_uncertainty_is_decided_by_no_rule_that_needs_it(
     tmp_path: Path, errors: xr.Dataset, monkeypatch: pytest.MonkeyPatch, rule: str, expected: int
 ) -> None:
-    monkeypatch.setattr(Foreign, "figures", lambda _: [FigureOfMerit("G", 5e-6, 0.0, "m")])
+    monkeypatch.setattr(Foreign, "figures", lambda _self, _: [FigureOfMerit("G", 5e-6, 0.0, "m")])
     monkeypatch.setattr(plugins, "owner_of_method", {"foreign": Foreign}.get)
     errors["covariance"][:] = 0.0
     table = limits(tmp_path, f'rule = "{rule}"\nfigures = {{ G = "7 um" }}\nfreedoms = {{ EX = "7 um" }}')

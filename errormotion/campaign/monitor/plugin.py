@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import ClassVar
 
 from errormotion.campaign.monitor.schema import RAW_SCHEMAS
-from errormotion.plugins import DatasetInfo, lazy
+from errormotion.plugins import DatasetInfo, DatasetPlugin, lazy
 
 
-class MonitorLog:
+class MonitorLog(DatasetPlugin):
     """The log of a monitor."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(

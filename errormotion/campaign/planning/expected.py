@@ -16,8 +16,7 @@ def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
     """Return the planned error dataset of a test, whose covariance is the expected one."""
     method, settings = test.method(), test.settings
     with looking_beside(plan.folder):
-        if hasattr(method, "planning_settings"):
-            settings = method.planning_settings(settings, plan.bench.chosen(test.instruments).settings_by_kind)
+        settings = method.planning_settings(settings, plan.bench.chosen(test.instruments).settings_by_kind)
         found: xr.Dataset = method.plan(settings)
     return found
 

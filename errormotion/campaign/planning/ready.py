@@ -49,8 +49,7 @@ def require_ready(
 
 def cannot_continue(test: TestPlan) -> str:
     """Return why an interrupted measurement of a test cannot be continued; empty if it can."""
-    stated = getattr(test.method, "cannot_continue", None)
-    return "" if stated is None else str(stated(test.method(), test.settings))
+    return str(test.method().cannot_continue(test.settings))
 
 
 def overdue(plan: CampaignPlan, tests: Iterable[TestPlan], today: date) -> list[str]:
@@ -99,9 +98,9 @@ def _obstacles(plan: CampaignPlan, test: TestPlan) -> list[str]:
     bench = plan.bench.chosen(test.instruments)
     try:
         opened = OpenBench.closed(bench)
-        check = getattr(test.method, "check_bench", None)
-        if check is not None:
-            return list(check(test.method(), test.settings, opened, tuple(test.inputs)))
+        found = test.method().check_bench(test.settings, opened, tuple(test.inputs))
+        if found is not None:
+            return list(found)
         if not moves(steps_of(test.method, test.settings, bench.settings_by_kind)):
             return []
     except ErrormotionError as error:

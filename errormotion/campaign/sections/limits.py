@@ -149,10 +149,10 @@ def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[St
     MethodError
         The method cannot determine its motions, or states an invalid step.
     """
-    motions = getattr(method, "motions", None)
+    motions = method().motions(settings, instruments)
     if motions is None:
         return None
-    steps: list[Any] = list(method().motions(settings, instruments))
+    steps: list[Any] = list(motions)
     for number, step in enumerate(steps):
         if not isinstance(step, Step) or not _possible(step):
             raise MethodError(

@@ -84,17 +84,16 @@ def read_machine(data: Mapping[str, Any], *, key: str = "machine") -> tuple[Mach
 
 def completed(method: Any, settings: Any, machine: MachineDescription | None) -> Any:
     """Return the settings of a method; those that are not stated get the defaults of the machine."""
-    defaults = getattr(method(), "machine_defaults", None)
-    if defaults is None or machine is None:
+    if machine is None:
         return settings
-    given = {key: value for key, value in defaults(machine).items() if key not in settings.model_fields_set}
+    defaults = method().machine_defaults(machine)
+    given = {key: value for key, value in defaults.items() if key not in settings.model_fields_set}
     return settings.model_copy(update=given)
 
 
 def contradictions(method: Any, settings: Any, machine: MachineDescription | None) -> Mapping[str, str]:
     """Return the contradictions between the settings of a method and the machine, by setting."""
-    check = getattr(method(), "check_machine", None)
-    return {} if check is None or machine is None else dict(check(settings, machine))
+    return {} if machine is None else dict(method().check_machine(settings, machine))
 
 
 def limits_within(limits: Limits, machine: MachineDescription) -> tuple[Limits, list[str]]:

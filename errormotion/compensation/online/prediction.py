@@ -82,7 +82,8 @@ class Predictor(Protocol):
 
 def predicts(schema: str) -> bool:
     """Return whether datasets of a schema are models that predict errors from readings."""
-    return hasattr(plugins.owner_of_schema(schema), "predictor")
+    owner = plugins.owner_of_schema(schema)
+    return owner is not None and plugins.states(owner, "predictor")
 
 
 def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predictor:
@@ -101,8 +102,7 @@ def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predi
     """
     schema = str(model.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)
-    make = getattr(owner, "predictor", None)
-    if make is None:
+    if not predicts(schema):
         raise CompensationError(f"Expected a model that predicts errors from readings; found the schema '{schema}'")
-    found: Predictor = make(model, functional_point)
+    found: Predictor = owner().predictor(model, functional_point)
     return found

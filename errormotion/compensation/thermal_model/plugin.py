@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from errormotion.plugins import DatasetInfo, lazy
+from errormotion.plugins import DatasetInfo, DatasetPlugin, lazy
 
 
-class ThermalModelDataset:
+class ThermalModelDataset(DatasetPlugin):
     """Thermal models, and the error datasets that they predict."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(

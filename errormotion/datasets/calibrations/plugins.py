@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from errormotion.plugins import DatasetInfo, lazy
+from errormotion.plugins import DatasetInfo, DatasetPlugin, lazy
 
 
-class InclinationCalibrationDataset:
+class InclinationCalibrationDataset(DatasetPlugin):
     """Calibration of the inclination error of a point sensor."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(
@@ -18,7 +18,7 @@ class InclinationCalibrationDataset:
     violations = lazy("errormotion.datasets.calibrations.inclination:violations")
 
 
-class PretravelMapDataset:
+class PretravelMapDataset(DatasetPlugin):
     """Pre-travel map of a touch probe."""
 
     info: ClassVar[DatasetInfo] = DatasetInfo(

@@ -64,8 +64,9 @@ def _no_errors(ds: xr.Dataset, asked: str) -> DatasetError:
 def _accessor(ds: xr.Dataset) -> ErrorMotion | Pictured:
     schema = ds.attrs.get("schema")
     owner = plugins.owner_of_schema(schema) if isinstance(schema, str) and schema != SCHEMA else None
-    draw = getattr(owner, "plot", None)
-    return ErrorMotion(ds) if draw is None else Pictured(ds, draw)
+    if owner is None or not issubclass(owner, plugins.DatasetPlugin) or not plugins.states(owner, "plot"):
+        return ErrorMotion(ds)
+    return Pictured(ds, owner().plot)
 
 
 xr.register_dataset_accessor("em")(_accessor)  # type: ignore[no-untyped-call]

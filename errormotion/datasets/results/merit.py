@@ -27,12 +27,14 @@ def figures_of(errors: xr.Dataset) -> list[FigureOfMerit]:
     if is_planned(errors):
         return []
     owner = plugins.owner_of_method(str(errors.attrs.get("method")))
-    return list(owner.figures(errors)) if hasattr(owner, "figures") else last_values(errors)
+    stated = None if owner is None else owner().figures(errors)
+    return last_values(errors) if stated is None else list(stated)
 
 
 def states_figures(errors: xr.Dataset) -> bool:
     """Return whether the plugin that made a dataset states its figures of merit."""
-    return hasattr(plugins.owner_of_method(str(errors.attrs.get("method"))), "figures")
+    owner = plugins.owner_of_method(str(errors.attrs.get("method")))
+    return owner is not None and plugins.states(owner, "figures")
 
 
 def stored(figure: FigureOfMerit) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from errormotion.errors import DatasetError
 from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
+from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-class BeamDirection:
+class BeamDirection(Method):
     """Origin and direction of the beam of a point sensor, from its readings on planes while a stage moves it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(

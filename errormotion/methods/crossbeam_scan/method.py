@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
+from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
 
 
-class CrossbeamScan:
+class CrossbeamScan(Method):
     """Thermal errors of the carriage on a crossbeam, from repeated scans of artefacts below it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(

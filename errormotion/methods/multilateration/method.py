@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
+from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
 
 
-class Multilateration:
+class Multilateration(Method):
     """Errors of the volume and of the axes from distances of a reflector to four or more positions of a tracker."""
 
     info: ClassVar[MethodInfo] = MethodInfo(

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from errormotion.plugins import MethodSubject
+from errormotion.plugins import MethodSubject, states
 from errormotion.testing.kit import DoesNotApplyError, require
 from errormotion.testing.results import covariance, influence, names, place_dims, truth_at_places, values
 
@@ -80,7 +80,7 @@ def differences(subject: MethodSubject) -> str:
 
 def no_figures(subject: MethodSubject) -> str:
     """Return why the check of the figures does not apply; empty if it may apply."""
-    return "" if hasattr(subject.plugin, "figures") else "the method states no figures"
+    return "" if states(subject.plugin, "figures") else "the method states no figures"
 
 
 def figures(subject: MethodSubject) -> str:

@@ -22,7 +22,7 @@ from errormotion.datasets.schemas import variants
 from errormotion.errors import ErrormotionError
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF
-from errormotion.plugins import MethodInfo, MethodSubject, Needs, kind_registry
+from errormotion.plugins import MethodInfo, MethodSubject, Needs, kind_registry, states
 from errormotion.testing.checks import shared
 from errormotion.testing.checks.coverage import coverage, differences, figures, no_figures, recovers_truth
 from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
@@ -70,10 +70,10 @@ def settings_strict(subject: MethodSubject) -> str:
 def motions_stated(subject: MethodSubject) -> str:
     """A method that can move a machine, by programs or by a kind named in its package, states its motions."""
     plugin = subject.plugin
-    if hasattr(plugin, "motions"):
+    if states(plugin, "motions"):
         return "motions are stated"
     name, source = plugin.info.id, Path(str(sys.modules[plugin.__module__].__file__))
-    require(not hasattr(plugin, "programs"), f"'{name}' writes NC programs and does not state its motions ('motions')")
+    require(not states(plugin, "programs"), f"'{name}' writes NC programs and does not state its motions ('motions')")
     moving = {each for each in kind_registry.kinds() if kind_registry.kind_changes_machine(each)}
     found = sorted(moving & (set(plugin.needs.instruments) | _texts_of(source)))
     named = " and ".join(found)
@@ -97,7 +97,7 @@ def _texts_of(source: Path) -> frozenset[str]:
 def schema(subject: MethodSubject) -> str:
     """Raw data and result conform to their schemas, and the result states its method and settings."""
     raw = raw_data(subject)
-    tables = tuple(getattr(subject.plugin, "raw_schemas", ()))
+    tables = tuple(subject.plugin.raw_schemas)
     if tables or variants(str(raw.attrs.get("schema"))):  # a method without tables validates its raw data itself
         datasets.validate(raw, tables)
     expected = subject.plugin.needs.raw_schema
@@ -123,7 +123,7 @@ def joins_along_a_dimension(subject: MethodSubject) -> str:
     raw = raw_data(subject)
     # Acquired data may be another variant of the schema than the data of the kit.
     known = {str(d) for d in raw.dims}
-    tables = getattr(method, "raw_schemas", ()) or variants(method.needs.raw_schema)
+    tables = method.raw_schemas or variants(method.needs.raw_schema)
     known |= {d for table in tables for row in table.rows for d in row.dims}
     require(dim in known, f"append_dim: expected one of {', '.join(sorted(known))}; found '{dim}'")
     require(0 < length < float("inf"), f"progress: expected a positive length, found {length}")
@@ -358,7 +358,7 @@ def plan(subject: MethodSubject) -> str:
 
 def why_nothing_expected(subject: MethodSubject) -> str:
     """Return why a plan cannot be compared with the identification of what it expects; empty if it can."""
-    return "" if hasattr(subject.plugin, "expected") else "the method has no expected raw data (expected)"
+    return "" if states(subject.plugin, "expected") else "the method has no expected raw data (expected)"
 
 
 @METHOD_CHECKS.add(why_not=why_nothing_expected)

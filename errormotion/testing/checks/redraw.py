@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.random import SeedSequence
 
 from errormotion.montecarlo.trials import redrawing_of, sample, trial
-from errormotion.plugins import MethodSubject, Redrawing
+from errormotion.plugins import MethodSubject, Redrawing, states
 from errormotion.testing.checks.coverage import require_honest, tested_places
 from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, names, raw_data, values
@@ -25,7 +25,7 @@ SMALL = 1e-3
 
 def why_no_redrawing(subject: MethodSubject) -> str:
     """Return why the checks do not apply: the method has no draws of its sources."""
-    return "" if hasattr(subject.plugin, "redrawing") else "the method has no draws of its sources (redrawing)"
+    return "" if states(subject.plugin, "redrawing") else "the method has no draws of its sources (redrawing)"
 
 
 def sources_drawn(subject: MethodSubject) -> str:

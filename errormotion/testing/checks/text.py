@@ -10,8 +10,7 @@ from errormotion.testing.results import raw_data
 
 def languages_of(subject: MethodSubject) -> list[str]:
     """Return the languages of the catalogues of a method."""
-    texts = getattr(subject.plugin(), "texts", None)
-    return [language for language in LANGUAGES if texts is not None and texts(language)]
+    return [language for language in LANGUAGES if subject.plugin().texts(language)]
 
 
 def why_no_texts(subject: MethodSubject) -> str:

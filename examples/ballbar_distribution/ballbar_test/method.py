@@ -5,10 +5,10 @@ from ballbar_test.schema import RAW_SCHEMAS, SCHEMA
 from ballbar_test.settings import Settings
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
-from errormotion.plugins import MethodInfo, Needs, lazy
+from errormotion.plugins import Method, MethodInfo, Needs, lazy
 
 
-class Ballbar:
+class Ballbar(Method):
     """Circular test after ISO 230-4 with a telescoping ballbar."""
 
     info = MethodInfo(

@@ -15,7 +15,17 @@ from errormotion import datasets
 from errormotion.datasets import provenance
 from errormotion.datasets.units import Frequency, Length
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.plugins import Identity, InstrumentInfo, MethodInfo, Needs, PluginSettings, Redraw, Redrawing, Samples
+from errormotion.plugins import (
+    Identity,
+    InstrumentInfo,
+    Method,
+    MethodInfo,
+    Needs,
+    PluginSettings,
+    Redraw,
+    Redrawing,
+    Samples,
+)
 
 STEP = 1e-6
 
@@ -75,7 +85,7 @@ class RampSettings(PluginSettings):
     """Identification fails while this file does not exist."""
 
 
-class Ramp:
+class Ramp(Method):
     info = MethodInfo("ramp", "Records a ramp", "simulated_only")
     needs = Needs(("counter",), "errormotion.raw.ramp/1")
     Settings = RampSettings

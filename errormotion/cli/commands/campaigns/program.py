@@ -10,6 +10,7 @@ from errormotion.campaign.planning.release import announced, refuse, released, t
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.progress import Bars, on_terminal
 from errormotion.errors import BenchError
+from errormotion.plugins import states
 
 
 def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: bool) -> None:
@@ -32,7 +33,7 @@ def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: b
         raise BenchError(
             f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
         )
-    with_programs = [entry for entry in chosen if hasattr(entry.method, "programs")]
+    with_programs = [entry for entry in chosen if states(entry.method, "programs")]
     if not with_programs:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
         raise BenchError(f"{campaign}: the method {names} has no NC programs; nothing was written")

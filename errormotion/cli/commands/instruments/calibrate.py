@@ -45,7 +45,7 @@ def run(data: Path, out: Path, assignments: list[str], settings_file: Path | Non
 def _calibration_of(data: Path, schema: str) -> Calibration:
     """Return the calibration that evaluates readings of a schema."""
     owner = plugins.owner_of_schema(schema)
-    found: Calibration | None = getattr(owner, "calibrations", {}).get(schema)
+    found: Calibration | None = None if owner is None else owner.calibrations.get(schema)
     if found is None:
         known = {name for _, made in plugins.brought("calibrations", "methods", "datasets") for name in made}
         raise DatasetError(f"{data}: expected schema {' or '.join(sorted(known))}; found {schema}")

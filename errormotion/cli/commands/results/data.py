@@ -119,9 +119,9 @@ def _method_of(raw: Path) -> str:
     with reading(path), datasets.load(path) as dataset:
         schema = str(dataset.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)
-    if owner is None or not hasattr(owner, "identify"):
+    if owner is None or not issubclass(owner, plugins.Method):
         raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}")
-    if schema in getattr(owner, "calibrations", {}):
+    if schema in owner.calibrations:
         raise DatasetError(f"{path}: contains readings for a calibration; use 'errormotion calibrate'")
     return str(owner.info.id)
 
