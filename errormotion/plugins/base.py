@@ -202,14 +202,18 @@ class Method(Owner):
         return ()
 
 
+_BASES: Mapping[str, type[Owner]] = {"methods": Method, "datasets": DatasetPlugin}
+
+
 @cache
 def adapted(cls: Any, group: str) -> Any:
     """Return a plugin class with the base class of its group; one without it has the form of version 0.1."""
-    base = {"methods": Method, "datasets": DatasetPlugin}.get(group)
-    if base is None or not isinstance(cls, type) or issubclass(cls, base):
+    base = _BASES.get(group)
+    if base is None or not inspect.isclass(cls) or issubclass(cls, base):
         return cls
+    info: MethodInfo | DatasetInfo = getattr(cls, "info")  # noqa: B009 - of a class of any type
     warnings.warn(
-        f"The plugin '{cls.info.id}' does not extend errormotion.plugins.{base.__name__}; from version 0.3 on it must.",
+        f"The plugin '{info.id}' does not extend errormotion.plugins.{base.__name__}; from version 0.3 on it must.",
         PluginWarning,
         stacklevel=3,
     )
