@@ -54,7 +54,10 @@ def by_rows(
         steps = STEP * np.broadcast_to(np.asarray(table.scale, dtype=float), (width,))
         summed = seen.ndim == 2
         slots = 1 if summed else seen.shape[1]
-        parts = []
+        parts: list[Array] = []
+        if not width:
+            found.append(np.zeros((*column(equation(rows)).shape, slots, 0)))
+            continue
         for slot in range(slots):
             for col in range(width):
                 at: Any = (slice(None), col) if summed else (slice(None), slot, col)
