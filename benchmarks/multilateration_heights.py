@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from errormotion.methods.multilateration.network.model import Stations, directions
+from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.planning.bound import bound
 
 NOISE = 1e-6
@@ -40,8 +40,7 @@ def known(u: np.ndarray, U: np.ndarray) -> np.ndarray:
 
     Its position is known, and its noise is in all readings of a station.
     """
-    n = len(U)
-    e = directions(u, Stations(U, np.zeros(n), np.zeros(0))).transpose(1, 0, 2)
+    e = directions(u, U).transpose(1, 0, 2)
     inverse = np.linalg.pinv(e)
     return NOISE * np.sqrt(2 * np.trace(inverse @ inverse.transpose(0, 2, 1), axis1=1, axis2=2))
 

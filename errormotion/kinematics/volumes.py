@@ -281,7 +281,7 @@ class AxisErrors:
         if not S.any():
             return np.full(q.shape, np.nan), np.full(q.shape, np.nan)
         inside = (q >= self.volume.low[axis] - SAME) & (q <= self.volume.high[axis] + SAME)
-        variance = np.einsum("ka,ab,kb->k", S, self.covariance, S) + self.rest_at(motion, q)
+        variance = np.einsum("ka,ka->k", S @ self.covariance, S) + self.rest_at(motion, q)
         value = np.where(inside, S @ self.coefficient, np.nan)
         return value, np.where(inside, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 

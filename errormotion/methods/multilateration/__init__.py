@@ -4,11 +4,10 @@
 predicts the uncertainty of a layout, ``report`` and ``figures`` present a result, ``simulation`` makes raw data with
 known errors.
 
-``network`` solves for targets and stations: ``model`` (the equations), ``start`` (approximate stations), ``descent``
-(Gauss-Newton with every target eliminated), ``turning`` (the datum), ``outliers`` (wrong readings), ``determinacy``
-(undetermined freedoms), ``network`` (result and covariances), over ``target_sums`` (array operations). Source:
-Takeuchi et al., estimation of three-dimensional volumetric errors of numerically controlled machine tools by a laser
-tracker.
+``network`` solves for targets and stations: ``model`` (the equation and its sources, for `errormotion.estimation`),
+``start`` (approximate stations), ``solver`` (fit, datum, outliers), ``network`` (result and covariances), and
+``diagnosis`` (outliers, undetermined freedoms). Source: Takeuchi et al., estimation of three-dimensional volumetric
+errors of numerically controlled machine tools by a laser tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration

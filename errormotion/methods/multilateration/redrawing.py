@@ -33,7 +33,7 @@ def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redraw
     reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(
         raw["displacement_noise"].attrs
     )
-    quiet = {"robust": False, "noise": "stated", "parametric": False, "alternating": False}
+    quiet = {"robust": False, "noise": "stated", "parametric": False}
     if settings.repeatability is not None:
         quiet |= {
             "repeatability": settings.repeatability * DRAWN_NOISE,

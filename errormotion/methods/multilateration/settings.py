@@ -203,13 +203,6 @@ class Settings(PluginSettings):
     measuring: Measuring = Field(default_factory=Measuring, description="how the targets are measured")
 
     # The network
-    start: Literal["nominal", "distances"] = Field(
-        default="nominal",
-        description="start values of the stations: approximate positions, or from the distances",
-    )
-    alternating: bool = Field(
-        default=False, description="also use the published scheme, stations and targets alternately, for comparison"
-    )
     robust: bool = Field(default=True, description="exclude readings that contradict the others, and name them")
     noise: Literal["auto", "stated"] = Field(
         default="auto", description="the stated noise of the readings, raised where they scatter more (auto)"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network import descent
 from errormotion.methods.multilateration.network.diagnosis.determinacy import swapped_stations
 from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 from errormotion.methods.multilateration.network.solver import solve
@@ -111,8 +110,7 @@ def test_a_target_at_a_station_and_extreme_noise_are_refused():
 
 
 @pytest.mark.slow
-def test_any_stations_result_in_a_network_or_a_method_error(monkeypatch):
-    monkeypatch.setattr(descent, "PASSES", 60)  # most of these never converge
+def test_any_stations_result_in_a_network_or_a_method_error():
     rng, refused = np.random.default_rng(0), 0
     for k in range(60):
         station = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-8, 3, (4, 1))
@@ -191,14 +189,14 @@ def test_a_target_in_the_stations_plane_does_not_move_the_others(n):
     d[:, 7] = np.nan
     without = solve(d, u, noise=1e-6)
     others = np.arange(60) != 7
-    # It is off by nearly a millimetre, and the mean of sixty targets by a sixtieth of that if it had a say.
-    assert abs(network.target[7, 2] - u[7, 2]) > 0.5e-3
+    # It would be off by nearly a millimetre, and the mean of sixty targets by a sixtieth of that if it had a say.
+    assert np.isnan(network.target[7]).all()
     assert np.abs(network.target[others] - without.target[others]).max() < 1e-11
     assert np.abs(network.station - without.station).max() < 1e-11
     assert np.allclose(network.target_covariance[others], without.target_covariance[others], rtol=1e-9, atol=1e-18)
     assert not network.in_datum[7]
     assert network.in_datum[others].all()
-    assert any("not used for the datum (1): 8" in note for note in notes_of(network))
+    assert any("without a position (1): 8" in note for note in notes_of(network))
 
 
 def test_swapped_stations_are_noted_and_do_not_affect_the_targets():

@@ -162,7 +162,7 @@ def test_rotations_in_the_budget_are_dashes_and_never_zero(html):
             "axes_sigma0",
         ],
         ["station_place", "station_covariance"],
-        ["target_nominal", "target_place", "noise", "sigma0", "freedom", "iterations", "condition"],
+        ["target_nominal", "target_place", "noise", "sigma0", "freedom", "condition"],
     ],
 )
 def test_missing_variables_are_accepted(tmp_path, lost):
@@ -179,14 +179,6 @@ def test_a_chapter_of_only_errors_states_what_is_missing(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_alternating_scheme_is_reported_if_it_was_applied(tmp_path):
-    html = words(
-        page(bare(alternating_iterations=((), 715), alternating_left=((), 0.25e-6), iterations=((), 4)), tmp_path)
-    )
-    assert "iterations 4" in html
-    assert "iterations of the alternating scheme 715 its estimated remaining error / µm 0.250" in html
-
-
 @pytest.mark.usefixtures("unprinted")
 def test_unknown_targets_are_counted(tmp_path):
     errors = measured()[0].copy(deep=True)

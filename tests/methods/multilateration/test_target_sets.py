@@ -110,9 +110,9 @@ def test_the_prediction_for_the_axes_is_the_scatter_of_fits():
         d = np.linalg.norm(there - STATIONS[:, None], axis=2)
         d = d + NOISE * rng.normal(size=d.shape)
         network = solve(d, place[chosen], STATIONS, noise=NOISE, robust=False)
-        own, factor, _ = network.blocks()
+        influence = np.array([each.effect for each in network.moved.errors.sources[: len(network.errors.sources)]])
         axes = fit_machine(
-            CHAIN, GRID[chosen], network.target - place[chosen], own, factor.transpose(2, 0, 1),
+            CHAIN, GRID[chosen], network.target - place[chosen], network.errors.own, influence,
             reflector=np.tile(REFLECTOR, (len(chosen), 1)), max_order=4,
         )  # fmt: skip
         found = axes.volume.columns(axes.terms, GRID, np.tile(REFLECTOR, (len(GRID), 1))) @ axes.coefficient

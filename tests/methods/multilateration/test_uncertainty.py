@@ -6,9 +6,8 @@ import pytest
 from errormotion import datasets
 from errormotion.errors import DatasetError
 from errormotion.methods.multilateration import Multilateration, Settings, simulation
-from errormotion.methods.multilateration.identification import result, uncertainty
-from errormotion.methods.multilateration.identification.uncertainty import Scatter, responses
-from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.identification import result
+from errormotion.methods.multilateration.identification.uncertainty import Scatter
 from errormotion.twin import VirtualMachine
 
 
@@ -22,7 +21,6 @@ def raw():
 def test_the_block_size_has_no_effect(raw, monkeypatch):
     settings = Settings(scale_uncertainty="1 um/m", expansion={"coefficient": 11.5e-6, "temperature": 23.0})
     whole = Multilateration().identify(raw, settings)
-    monkeypatch.setattr(uncertainty, "BLOCK", 7)
     monkeypatch.setattr(result, "BLOCK", 11)
     pieces = Multilateration().identify(raw, settings)
     datasets.validate(pieces)
@@ -48,18 +46,6 @@ def test_violations_are_found_in_any_block(monkeypatch):
             frame="machine", functional_point=[0, 0, 0], reference="r", method="multilateration", method_version="1",
             provenance={}, sources=["a"], source_groups=["a"],
         )  # fmt: skip
-
-
-def test_responses_in_blocks_are_those_of_the_network(raw, monkeypatch):
-    monkeypatch.setattr(uncertainty, "BLOCK", 7)
-    d, u = raw["displacement"].values, raw["target_nominal"].values
-    network = solve(d, u, raw["station_nominal"].values, noise=1e-6)
-    rng = np.random.default_rng(1)
-    changes = [1e-6 * rng.normal(size=d.shape), np.nan_to_num(d) * 1e-6]
-    found = responses(network, changes)
-    for k, change in enumerate(changes):
-        moved = np.concatenate([found.of(part)[k] for part in uncertainty.blocks(len(u))])
-        np.testing.assert_allclose(moved, network.response(change)[0], rtol=1e-6, atol=1e-13)
 
 
 def test_shares_of_the_scatter_are_those_of_the_variance():

@@ -6,7 +6,6 @@ on the targets is computed by the network.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +17,7 @@ from errormotion.methods.multilateration.identification.refraction import (
     refractive_index,
     sensitivities,
 )
+from errormotion.methods.multilateration.network.model import SCALES, Shared
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,15 +27,6 @@ if TYPE_CHECKING:
 LABORATORY = (20.0, 101325.0, 0.5)
 """Temperature (degC), pressure (Pa) and humidity at which the effect of an unrecorded state of the air is computed."""
 _AIR = ("air_temperature", "air_pressure", "relative_humidity")
-
-
-@dataclass(frozen=True)
-class Shared:
-    """A source that many readings share, as the change of the readings by its standard uncertainty, (n, m), m."""
-
-    name: str
-    group: str
-    change: Array
 
 
 def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | float, dict[str, float]]:
@@ -66,7 +57,7 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
             "The state of the air is not in the data: displacements are assumed to be compensated for it. An error of "
             "1 K of the air temperature changes lengths by 1 um/m."
         )
-        return 1.0, _causes(*LABORATORY, air.wavelength, air)
+        return 1.0, causes(*LABORATORY, air.wavelength, air)
     T, p, h = (np.asarray(raw[name].transpose("station", "target").values, dtype=float) for name in _AIR)
     _refuse_unknown_air(raw, {"air_temperature": T, "air_pressure": p, "relative_humidity": h})
     wavelength = float(raw["vacuum_wavelength"]) if "vacuum_wavelength" in raw else air.wavelength
@@ -75,10 +66,10 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
         used = np.asarray(raw["refractive_index"].transpose("station", "target").values, dtype=float)
         factor = used / refractive_index(T, p, h, air.co2, wavelength)
     mean_T, mean_p, mean_h = (float(np.nanmean(value)) for value in (T, p, h))
-    return factor, _causes(mean_T, mean_p, mean_h, wavelength, air)
+    return factor, causes(mean_T, mean_p, mean_h, wavelength, air)
 
 
-def _causes(temperature: float, pressure: float, humidity: float, wavelength: float, air: Air) -> dict[str, float]:
+def causes(temperature: float, pressure: float, humidity: float, wavelength: float, air: Air) -> dict[str, float]:
     """Return the relative standard uncertainties of lengths in air of this state, by cause."""
     derivatives = sensitivities(temperature, pressure, humidity, air.co2, wavelength)
     stated = {
@@ -148,12 +139,12 @@ def expansion_sources(excess: Array, position: Array, e: Array, expansion: Expan
     changes = [
         Shared(
             "coefficient of expansion",
-            "scales",
+            SCALES,
             along_beams(expansion.coefficient_uncertainty * excess, centred, e),
         )
     ]
     for k, axis in enumerate("XYZ"):
         strain = np.zeros_like(excess)
         strain[:, k] = expansion.coefficient * expansion.temperature_uncertainty
-        changes.append(Shared(f"scale temperature {axis}", "scales", along_beams(strain, centred, e)))
+        changes.append(Shared(f"scale temperature {axis}", SCALES, along_beams(strain, centred, e)))
     return [shared for shared in changes if np.nanmax(np.abs(shared.change)) > 0]

@@ -56,9 +56,9 @@ def prepare(raw: xr.Dataset, settings: Settings) -> State:
     notes: list[str] = []
     data = read(raw, notes)
     notes += assumptions(raw, settings)
-    factor, scale = air_scale(raw, settings.air, notes)
+    factor, air = air_scale(raw, settings.air, notes)
     machine = repeatability.stated(settings.repeatability, settings.repeatability_uncertainty)
-    state = State(raw, settings, data, notes, data.displacement * factor, scale, machine)
+    state = State(raw, settings, data, notes, data.displacement * factor, air, machine)
     weak = weak_targets(state.displacement, data.nominal, state.stations, state.noise())
     if weak.any():
         state.displacement[:, weak] = np.nan
@@ -78,10 +78,8 @@ def solve(state: State) -> None:
     MethodError
         Readings that do not fit a network; the message states the station if one was moved.
     """
-    sources = [] if state.drift is None else state.drift.sources
-    extra = np.nan_to_num([source.change for source in sources]) if sources else None
     try:
-        state.network = _network(state, state.settings.robust, extra)
+        state.network = _network(state, state.settings.robust)
     except MethodError as error:
         try:
             _network(state, robust=False)
@@ -91,11 +89,11 @@ def solve(state: State) -> None:
         raise
 
 
-def _network(state: State, robust: bool, extra: Array | None = None) -> Network:
-    """Return the network of the present readings, with further parameters ``extra`` (k, n, m) of prior 1."""
+def _network(state: State, robust: bool) -> Network:
+    """Return the network of the present readings and sources."""
     return solver.solve(
         state.displacement, state.data.nominal, state.stations, noise=state.noise(), robust=robust,
-        extra=extra, extra_prior=None if extra is None else np.ones(len(extra)),
+        sources=state.sources,
     )  # fmt: skip
 
 
@@ -109,7 +107,7 @@ def correct(state: State) -> None:
     if expansion is not None:
         excess, strain = scale_strain(state.raw, expansion)
         correction = correction + along_beams(strain, data.position - data.position.mean(axis=0), beams)
-        state.sources += expansion_sources(excess, data.position, beams, expansion)
+        state.scales += expansion_sources(excess, data.position, beams, expansion)
     if expansion is not None or correction.any():
         state.displacement = state.displacement - correction
         solve(state)

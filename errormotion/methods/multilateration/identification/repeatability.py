@@ -109,7 +109,7 @@ def from_positions(
     freedom = 3 * sum(len(g) - 1 for g in groups)
     if not freedom:
         return before
-    own = factor**2 * network.blocks(np.concatenate(groups))[0]
+    own = factor**2 * network.fit.normal.own[np.concatenate(groups)]
     tracker = float(np.sqrt(np.trace(own, axis1=1, axis2=2).mean() / 3))
     square = sum(float(np.sum((network.target[g] - network.target[g].mean(axis=0)) ** 2)) for g in groups)
     total = square / freedom

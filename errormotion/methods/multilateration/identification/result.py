@@ -20,7 +20,6 @@ from errormotion.methods.multilateration.identification import uncertainty
 from errormotion.methods.multilateration.identification.parameters import fit_machine, misfit_note
 from errormotion.methods.multilateration.identification.state import State
 from errormotion.methods.multilateration.identification.volume import parametric_extras, parametric_labels
-from errormotion.methods.multilateration.network.alternating import alternate
 from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
 
 if TYPE_CHECKING:
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MIN_TARGETS = 10
-"""Number of targets required for four stations."""
 DATUM = (
     "best rigid fit of all targets to their commanded positions; the six rigid motions of the whole, three "
     "translations and three rotations, are not determined"
@@ -59,19 +56,16 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
     error = network.target - data.nominal
     values = np.full((len(error), 6), np.nan)
     values[:, :3] = error
-    extras, labels = _extras(state) | _alternated(state), _labels(state)
+    extras, labels = _extras(state), _labels(state)
     if (axes := _axes(state, error, parts)) is not None:
         extras |= parametric_extras(axes)
         labels |= parametric_labels(axes)
-    covariance = parts.covariance(network.target_covariance, state.factor**2)
-    if state.settings.together and state.machine.variance > 0:
-        covariance[:, :3, :3] += state.machine.variance * np.eye(3)
     for note in notes:
         log.warning(note)
     position, reflector = data.position, data.reflector
     ds = build(
         values,
-        covariance,
+        parts.covariance,
         parts.influence,
         {
             "target": ("target", np.array(data.targets), {}),
@@ -98,16 +92,10 @@ def result(state: State, method: str, version: str) -> xr.Dataset:
 
 def _uncertainty(state: State) -> Parts:
     """Return the parts of the targets' uncertainty."""
-    scales = [
-        (name, "scale of the tracker" if name == "tracker scale" else "refraction", relative)
-        for name, relative in state.scale.items()
-        if relative > 0
-    ]
-    parts = uncertainty.parts(
-        state.network, state.factor, state.scatter, scales, state.displacement if scales else np.empty(0), state.sources
-    )
+    parts = uncertainty.parts(state.network, state.factor, state.scatter)
     if state.settings.together and state.machine.variance > 0:
         parts.own[:] += state.machine.variance * np.eye(3)
+        parts.covariance[:, :3, :3] += state.machine.variance * np.eye(3)
     return parts
 
 
@@ -140,31 +128,6 @@ def _axes(state: State, error: Array, parts: Parts) -> AxisErrors | None:
     return axes
 
 
-def _alternated(state: State) -> dict[str, xr.DataArray]:
-    """Return the results of the published scheme for the targets with all readings, if the settings request them."""
-    data, network, notes = state.data, state.network, state.notes
-    if not state.settings.alternating:
-        return {}
-    complete = np.isfinite(state.displacement).all(axis=0)
-    if np.count_nonzero(complete) < MIN_TARGETS:
-        notes.append(f"The alternating scheme was not applied: fewer than {MIN_TARGETS} targets have all readings.")
-        return {}
-    start = network.station if data.station is None else data.station
-    other = alternate(state.displacement[:, complete], data.nominal[complete], start)
-    position = np.full(data.nominal.shape, np.nan)
-    position[complete] = other.target
-    notes.append(
-        f"The alternating scheme {'stopped' if other.converged else 'was ended'} after {other.iterations} iterations "
-        f"(joint solution: {network.iterations}); the estimated remaining error of a target is "
-        f"{other.remaining * 1e6:.2g} um."
-    )
-    return {
-        "alternating_place": xr.DataArray(position, dims=("target", "direction"), attrs={"units": "m"}),
-        "alternating_iterations": xr.DataArray(other.iterations),
-        "alternating_left": xr.DataArray(other.remaining, attrs={"units": "m"}),
-    }
-
-
 def _steps(state: State) -> list[str]:
     steps = ["Gauss-Newton of targets, stations and dead paths, targets eliminated"]
     if state.network.left_out:
@@ -191,7 +154,6 @@ def _labels(state: State) -> dict[str, Any]:
 
 def _extras(state: State) -> dict[str, xr.DataArray]:
     data, network, f2 = state.data, state.network, state.factor**2
-    n = len(data.stations)
 
     def array(values: Any, dims: tuple[str, ...], unit: str, meaning: str = "") -> xr.DataArray:
         attrs = ({"units": unit} if unit else {}) | ({"long_name": meaning} if meaning else {})
@@ -201,7 +163,7 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
     for j, i in network.left_out:
         left_out[j, i] = 1
     left_out[:, list(network.undecided)] = 2
-    dead_path_variance = np.diag(network.joint_covariance)[3 : 4 * n : 4]
+    dead_path_variance = np.diag(network.joint_covariance)[3::4]
     by_reading, vector = ("station", "target"), ("station", "direction")
     extras = {
         "target_nominal": array(data.nominal, ("target", "direction"), "m", "commanded position of the reflector"),
@@ -213,7 +175,6 @@ def _extras(state: State) -> dict[str, xr.DataArray]:
         "residual": array(network.residual, by_reading, "m", "reading minus model"),
         "redundancy": array(network.redundancy, by_reading, "1", "share of a reading's error that is in its residual"),
         "left_out": array(left_out, by_reading, "", "1: wrong; 2: target excluded, wrong reading not identified"),
-        "iterations": array(network.iterations, (), ""),
         "condition": array(network.condition, (), "1", "of the stations' information, without motions of the whole"),
         "sigma0": array(network.sigma0, (), "1", "ratio of the scatter of the readings to the stated one"),
         "freedom": array(network.freedom, (), "", "readings minus unknowns"),

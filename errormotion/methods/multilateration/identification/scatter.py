@@ -38,11 +38,6 @@ def evaluate_scatter(state: State) -> None:
                 f"Station {data.stations[j]} is {off[j] * 1e3:.3g} mm from its approximate position. Check this "
                 "position, and that the targets are stated in machine coordinates."
             )
-    state.scale["tracker scale"] = settings.scale_or_assumed
-    if not network.converged:
-        state.notes.append(
-            f"The network has not converged after {network.iterations} iterations; its results are approximate."
-        )
 
 
 def _set_noise_factor(state: State) -> None:

@@ -9,15 +9,15 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.model import directions
+from errormotion.methods.multilateration.network.model import Sources, directions
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.methods.multilateration.identification.drift import Drift
-    from errormotion.methods.multilateration.identification.expansion import Shared
     from errormotion.methods.multilateration.identification.repeatability import Repeatability
     from errormotion.methods.multilateration.identification.uncertainty import Scatter
+    from errormotion.methods.multilateration.network.model import Shared
     from errormotion.methods.multilateration.network.network import Network
     from errormotion.methods.multilateration.settings import Settings
 
@@ -75,14 +75,14 @@ class State:
         In the order of the steps.
     displacement : ndarray (n, m)
         Readings at the refractive index of the air, less corrections, m; NaN where missing or excluded.
-    scale : dict of str to float
-        Relative standard uncertainty of all lengths, by cause.
+    air : dict of str to float
+        Relative standard uncertainty of all lengths by the state of the air, by cause.
     machine : Repeatability
         Of the machine, as far as it is known.
     drift : Drift or None
         None if drift is not determined.
-    sources : list of Shared
-        Sources that many readings share, except for the drift.
+    scales : list of Shared
+        Sources of the expansion of the machine's scales.
     network : Network
         The present solution.
     factor : float
@@ -96,18 +96,24 @@ class State:
     data: Readings
     notes: list[str]
     displacement: Array
-    scale: dict[str, float]
+    air: dict[str, float]
     machine: Repeatability
     drift: Drift | None = None
-    sources: list[Shared] = field(default_factory=list)
+    scales: list[Shared] = field(default_factory=list)
     network: Network = field(init=False)
     factor: float = field(init=False, default=1.0)
     scatter: Scatter = field(init=False)
 
     @property
     def stations(self) -> Array | None:
-        """Approximate positions of the stations (n, 3), m, if they are to be used."""
-        return self.data.station if self.settings.start == "nominal" else None
+        """Approximate positions of the stations (n, 3), m."""
+        return self.data.station
+
+    @property
+    def sources(self) -> Sources:
+        """What is uncertain besides the noise of the readings."""
+        tracker = {"tracker scale": self.settings.scale_or_assumed}
+        return Sources(self.air, tracker, self.scales, [] if self.drift is None else self.drift.sources)
 
     def noise(self, machine: Repeatability | None = None) -> Array:
         """Return the standard deviation of the readings, the same for all, (n, m), m.
@@ -120,7 +126,7 @@ class State:
     def beams(self) -> Array:
         """Return unit vectors (n, m, 3) from the stations to the estimated targets, or else to the nominal ones."""
         target = self.network.target
-        return directions(np.where(np.isnan(target), self.data.nominal, target), self.network.stations)
+        return directions(np.where(np.isnan(target), self.data.nominal, target), self.network.station)
 
 
 def read(raw: xr.Dataset, notes: list[str]) -> Readings:

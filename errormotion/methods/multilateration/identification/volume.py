@@ -33,13 +33,13 @@ def parametric_extras(axes: AxisErrors) -> dict[str, xr.DataArray]:
     `volumetric_errors`. Their coordinates are `parametric_labels`.
     """
     extras: dict[str, xr.DataArray] = {}
-    volume = axes.volume
+    volume, orders = axes.volume, axes.orders
     includes = _includes(axes.undetermined)
     for k, (dim, q) in enumerate(_curve_positions(volume).items()):
         for error in volume.motions[6 * k : 6 * k + 6]:
             unit = _unit(error)
             attrs = {
-                "units": unit, "order": axes.orders.get(error, 0), "unseen": _reason(axes, error),
+                "units": unit, "order": orders.get(error, 0), "unseen": _reason(axes, error),
                 "includes": includes.get(error, ""),
             }  # fmt: skip
             value, u = axes.curve(error, q)

@@ -1,30 +1,34 @@
-"""Multilateration: targets, stations and dead paths from displacements, without outliers.
+"""Multilateration: targets, stations and dead paths from displacements, without outliers, as a free network.
 
-The solution of `descent` is fitted to the nominal targets by a rigid motion (see `network`).
+Distances do not determine the six rigid motions of the whole. They are the gauge of the least squares; the solution is
+then moved to the best fit of the targets to the nominal ones.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network import target_sums
-from errormotion.methods.multilateration.network.descent import State, descend
+from errormotion.errors import FitError, MethodError
+from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.normal import SingularError
+from errormotion.estimation.problem import Linear, Problem, Unknown, linearised
 from errormotion.methods.multilateration.network.diagnosis import determinacy, outliers
-from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets
-from errormotion.methods.multilateration.network.model import Stations
+from errormotion.methods.multilateration.network.diagnosis.weakness import datum_targets, unlocated
+from errormotion.methods.multilateration.network.model import Sources, Stations, stated
 from errormotion.methods.multilateration.network.network import Network
-from errormotion.methods.multilateration.network.problem import Problem, state_problem
-from errormotion.methods.multilateration.network.rigid_motion import Motion
 from errormotion.methods.multilateration.network.start import initial_stations
 
-TOLERANCE = 1e-12
-"""Displacement of a target by a further step, m, below which the iteration ends."""
+SAMPLE = 512
+"""Targets to which the stations are fitted first, if there are many."""
+_MIN_SAMPLES = 4  # numbers of targets, in samples, from which a sample is used
 DATUM_SAMPLE = 64
 """Number of evenly distributed targets whose datum is used to detect undetermined freedoms."""
+_TURNED = 1e-6
+"""Rotation of a solution into its datum that changes its derivatives noticeably, rad."""
 _GROSS_RMS = 100.0  # over the noise, from which gross outliers are searched first
 _MAX_SEARCHES = 12
 
@@ -35,11 +39,8 @@ def solve(
     station: ArrayLike | None = None,
     *,
     noise: ArrayLike = 1e-6,
-    dead_path: tuple[ArrayLike, ArrayLike] | None = None,
-    extra: ArrayLike | None = None,
-    extra_prior: ArrayLike | None = None,
+    sources: Sources | None = None,
     robust: bool = True,
-    tolerance: float = TOLERANCE,
 ) -> Network:
     """Estimate targets, stations and dead paths from displacements, in the frame of the nominal targets.
 
@@ -53,17 +54,10 @@ def solve(
         Approximate positions of the stations, m; default: from the distances.
     noise : array_like (), (n,) or (n, m)
         Standard deviation of a reading, m: of all, of each station's, of each.
-    dead_path : pair of array_like (n,), optional
-        Prior values of the dead paths and their standard uncertainties, m; 0: fixed, infinite: unknown. Default: all
-        are unknown.
-    extra : array_like (k, n, m), optional
-        Effect of a unit of each of k further parameters on every reading.
-    extra_prior : array_like (k,), optional
-        Standard uncertainty of each further parameter about 0. Default: infinite, unknown.
+    sources : Sources, optional
+        What is uncertain besides.
     robust : bool
         Whether to find and ignore outliers.
-    tolerance : float
-        Displacement of a target by a further step, m, below which the iteration ends.
 
     Returns
     -------
@@ -79,113 +73,192 @@ def solve(
     Model of Takeuchi et al. (estimation of volumetric errors by a laser tracker), with free dead paths instead of
     L_j = |u_1 - U_j|, so that the noise of the first target does not affect the others.
     """
-    problem = state_problem(displacement, target, noise, dead_path, extra, extra_prior)
-    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
-    positions = None if station is None else np.asarray(station, dtype=float)
-    start = initial_stations(problem.reading, problem.weight, problem.nominal, positions)
-    stations = Stations(start.position, start.dead_path, np.zeros(len(problem.extra)))
-    if dead_path is not None:
-        fixed = ~problem.free[3 : 4 * len(start.position) : 4]
-        known = np.where(fixed, problem.prior[3 : 4 * len(start.position) : 4], stations.dead_path)
-        stations = replace(stations, dead_path=known)
-    state = descend(problem, stations, problem.nominal, tolerance)
-    found = outliers.Outliers.none(problem.weight)
+    d, sd, nominal = _checked(displacement, target, noise)
+    approximate = None if station is None else np.asarray(station, dtype=float)
+    determinacy.refuse_too_few(d)
+    start = initial_stations(d, np.where(np.isfinite(d), 1.0 / sd, 0.0), nominal, approximate)
+    given = _Given(d, sd, nominal, Stations(start.position, start.dead_path), sources, approximate)
+    found = outliers.Outliers.none(d)
     if not robust:
-        return conclude(problem, state, start.position, positions)
-    original = problem.weight
-    if not state.sums.square < _GROSS_RMS**2 * problem.reading.size:
-        # Gross outliers: restart without them.
-        found = outliers.gross(problem.reading, original, problem.nominal, start.position, start.dead_path)
-        problem = _without(problem, original, found)
-        state = descend(problem, stations, problem.nominal, tolerance)
-    network = conclude(problem, state, start.position, positions, found)
+        return _network(given, found)
+    network, failure = None, None
+    try:
+        network = _network(given, found)
+    except MethodError as error:  # gross outliers make a network of another shape
+        failure = error
+    if network is None or not network.fit.chi2 < _GROSS_RMS**2 * d.size:
+        found = outliers.gross(d, nominal, start.position, start.dead_path)
+        if network is None and not found.left_out:
+            raise failure or MethodError("The distances fit no network.")
+        network = _network(given, found)
     for _ in range(_MAX_SEARCHES):
-        now = outliers.search(network, original, problem.nominal, found)
+        now = outliers.search(network, nominal, found)
         if now == found:
             break
         found = now
-        problem = _without(problem, original, found)
-        target = np.where(np.isfinite(network.target), network.target, problem.nominal)
-        state = descend(problem, network.stations, target, tolerance)
-        state = replace(state, passes=state.passes + network.iterations)
-        network = conclude(problem, state, start.position, positions, found)
+        network = _network(given, found, network.fit.linear.at)
     return network
 
 
-def _without(problem: Problem, original: Array, found: outliers.Outliers) -> Problem:
-    """Return the problem without outliers; ``original`` are the weights (n, m) of all readings."""
-    problem = problem.weighted(found.applied(original))
-    determinacy.refuse_too_few(problem.by_target, problem.by_station, problem.unknown)
-    return problem
-
-
-def conclude(
-    problem: Problem,
-    state: State,
-    start: Array,
-    approximate: Array | None = None,
-    found: outliers.Outliers | None = None,
+def at_truth(
+    reading: Array, sd: ArrayLike, target: Array, stations: Stations, sources: Sources | None = None
 ) -> Network:
-    """Return a solution in the datum.
-
-    Parameters
-    ----------
-    problem, state
-        Problem and solution.
-    start : ndarray (n, 3)
-        Approximate positions of the stations, m, stated or calculated, for the message on an undetermined freedom.
-    approximate : ndarray (n, 3), optional
-        Stated ones, m, for the note on swapped stations.
-    found : Outliers, optional
-        Readings that were ignored.
+    """Return the network of error-free readings (n, m) of known targets and stations, with its covariances.
 
     Raises
     ------
     MethodError
-        The distances leave a freedom undetermined.
+        Positions with an undetermined freedom.
     """
-    position, free = state.position, state.stations
-    traces, sums = target_sums.settle_targets(
-        problem.reading, problem.weight, free.position, free.dead_path, problem.extra, free.value,
-        position, problem.nominal, problem.centre,
-    )  # fmt: skip
-    in_datum = datum_targets(traces)
-    if np.count_nonzero(in_datum) != sums[0]:
-        sums = target_sums.moments(position, problem.nominal, in_datum, problem.centre)
-    some = slice(None, None, max(1, position.shape[1] // DATUM_SAMPLE))
-    determinacy.refuse_not_finite(position[:, some], state.sums.H, sums)
-    determinacy.refuse_flat(int(sums[0]), start, position[:, some].T)
-    motion = Motion.of(sums, problem.centre)
-    stations, target = motion.stations(free), target_sums.moved(position, motion.a, motion.b, motion.R, traces)
-    Z = problem.basis(stations, motion.b)
-    information = _within(state.sums.H, Z, motion.R, len(start))
-    # Undetermined freedoms are detected in the datum of some of the targets.
-    sample = np.flatnonzero(in_datum)[:: max(1, int(sums[0]) // DATUM_SAMPLE)]
-    GG, _, GF = target_sums.datum_sums(
-        problem.weight[:, sample],
-        stations.position,
-        problem.extra[:, :, sample],
-        target[sample],
-        in_datum[sample],
-        motion.b,
+    d, noise, nominal = _checked(reading, target, sd)
+    given = _Given(d, noise, nominal, stations, sources, None)
+    determinacy.refuse_too_few(d)
+    problem = _problem(given, d)
+    linear = linearised(problem, problem.start)
+    try:
+        return _concluded(Fit(linear, linear.normal()[0]), given, outliers.Outliers.none(d))
+    except SingularError as error:
+        raise _undetermined(linear, given) from error
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Readings and standard deviations (n, m), nominal targets (m, 3), a start, and stated positions of stations."""
+
+    reading: Array
+    sd: Array
+    nominal: Array
+    start: Stations
+    sources: Sources | None
+    approximate: Array | None
+
+    def every(self, step: int) -> _Given:
+        """Return every ``step``-th target, without drift."""
+        part = slice(step // 2, None, step)
+        return replace(
+            self, reading=self.reading[:, part], sd=self.sd[:, part], nominal=self.nominal[part], sources=None
+        )
+
+
+def _checked(displacement: ArrayLike, target: ArrayLike, noise: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return copies of readings (n, m), their standard deviations (n, m), and targets; raise for wrong shapes."""
+    d, u = np.array(displacement, dtype=float), np.array(target, dtype=float)
+    if d.ndim != 2 or u.shape != (d.shape[1], 3):
+        raise MethodError(
+            f"Expected displacements (station, target) and targets (target, 3); found {d.shape} and {u.shape}. "
+            "State a row of displacements for every station and a position for every target."
+        )
+    if not np.isfinite(u).all():
+        raise MethodError("Expected a nominal position for every target; found NaN. Remove such targets.")
+    n, m = d.shape
+    sd = np.asarray(noise, dtype=float)
+    sd = sd[:, None] if sd.ndim == 1 and len(sd) == n else sd
+    if sd.shape not in ((), (n, 1), (n, m)):
+        raise MethodError(
+            f"Expected the noise as one value, ({n},) or ({n}, {m}); found {sd.shape}. State it for all readings, "
+            "each station, or each reading."
+        )
+    sd = np.broadcast_to(sd, d.shape)
+    if not (sd[np.isfinite(d)] > 0).all():
+        raise MethodError("Expected a positive standard deviation of every reading. State the instrument's noise, m.")
+    d[~np.isfinite(d)] = np.nan
+    return d, np.where(sd > 0, sd, 1.0), u
+
+
+def _problem(given: _Given, used: Array) -> Problem:
+    """Return the problem of the used readings (n, m), without those of targets that have no position."""
+    lost = unlocated(used, given.sd, given.nominal, given.start.position)
+    determinacy.refuse_flat(int(np.count_nonzero(~lost)), given.start.position, given.nominal)
+    return stated(np.where(lost, np.nan, used), given.sd, given.nominal, given.start, given.sources)
+
+
+def _network(given: _Given, found: outliers.Outliers, at: Unknown | None = None) -> Network:
+    """Return the network without outliers."""
+    used = np.where(found.out, np.nan, given.reading)
+    determinacy.refuse_too_few(used)
+    if at is None and (step := used.shape[1] // SAMPLE) >= _MIN_SAMPLES:
+        at = _from_sample(given.every(step), used[:, step // 2 :: step], given)
+    return _concluded(_in_datum(_problem(given, used), given, at), given, found)
+
+
+def _from_sample(sample: _Given, used: Array, given: _Given) -> Unknown | None:
+    """Return a start with the stations fitted to a sample of the targets, in its datum; None if that fails."""
+    try:
+        stations = _moved(_fitted(_problem(sample, used), sample, None), sample)[0].unknowns.station
+    except MethodError:
+        return None
+    start = _problem(given, given.reading).start
+    return replace(start, tables=[start.tables[0], stations, start.tables[2]])
+
+
+def _in_datum(problem: Problem, given: _Given, at: Unknown | None) -> Fit:
+    """Return the solution, moved to the best fit of its targets to the nominal ones."""
+    solution, turned = _moved(_fitted(problem, given, at), given)
+    if turned > _TURNED:
+        solution, _ = _moved(_fitted(problem, given, solution.linear.at), given)
+    return solution
+
+
+def _fitted(problem: Problem, given: _Given, at: Unknown | None) -> Fit:
+    try:
+        return fit(problem, what="the distances", start=at)
+    except FitError as error:
+        if isinstance(error.__cause__, SingularError):
+            raise _undetermined(linearised(problem, problem.start if at is None else at), given) from error.__cause__
+        raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
+
+
+def _moved(found: Fit, given: _Given) -> tuple[Fit, float]:
+    """Return a solution moved as a whole to the nominal targets, by values only, and the angle of its rotation, rad.
+
+    The rotation is that of Kabsch, from the singular vectors of the cross products.
+    """
+    datum = _datum(found)
+    determinacy.refuse_flat(int(datum.sum()), given.start.position, given.nominal)
+    x = found.unknowns
+    a, b = x.target[datum].mean(axis=0), given.nominal[datum].mean(axis=0)
+    U, _, Vt = np.linalg.svd((given.nominal[datum] - b).T @ (x.target[datum] - a))
+    if np.linalg.det(U @ Vt) < 0.0:
+        U[:, 2] *= -1.0
+    R = U @ Vt
+    target, station = (x.target - a) @ R.T + b, x.station.copy()
+    station[:, :3] = (station[:, :3] - a) @ R.T + b
+    at = replace(found.linear.at, tables=[target, station, x.drift])
+    return Fit(replace(found.linear, at=at), found.normal), float(np.linalg.norm(R - np.eye(3)))
+
+
+def _datum(found: Fit) -> NDArray[np.bool_]:
+    """Return which targets define the datum, (m,)."""
+    free = found.problem.unknowns.target.freed[:, 0]
+    return datum_targets(np.where(free, np.trace(found.normal.own, axis1=1, axis2=2), np.inf))
+
+
+def _concluded(found: Fit, given: _Given, out: outliers.Outliers) -> Network:
+    """Return the network of a solution in the datum; raise MethodError if a freedom is undetermined."""
+    datum, x, normal = _datum(found), found.unknowns, found.normal
+    determinacy.refuse_flat(int(datum.sum()), given.start.position, given.nominal)
+    stations = Stations(x.station[:, :3], x.station[:, 3])
+    values = determinacy.refuse_undetermined(
+        normal.S, normal.F, stations, x.target, datum, given.start.position, DATUM_SAMPLE
     )
-    determinacy.refuse_not_finite(GG, GF)
-    basis = Z - stations.motions(motion.b) @ np.linalg.lstsq(GG, GF @ Z)[0]
-    values = determinacy.refuse_undetermined(information, basis, stations, target[sample], start)
-    W = Z @ np.linalg.inv(np.linalg.cholesky(information)).T
-    known = int(np.count_nonzero(problem.free & (problem.precision > 0)))
-    freedom = int(problem.by_station.sum()) + known - 3 * int(np.count_nonzero(problem.by_target >= 3)) - W.shape[1]
-    sigma0 = float(np.sqrt(state.sums.square / freedom)) if freedom > 0 else np.nan
-    found = found or outliers.Outliers.none(problem.weight)
     return Network(
-        target, stations, problem.reading, problem.weight, found.left_out, found.undecided, sigma0, freedom,
-        state.passes, state.converged, float(values[-1] / values[0]), problem.extra, in_datum, motion.b, W, approximate,
+        found, given.reading, given.nominal, datum, float(values[-1] / values[0]), out.left_out, out.undecided,
+        given.approximate,
     )  # fmt: skip
 
 
-def _within(H: Array, Z: Array, R: Array, stations: int) -> Array:
-    """Return the information H within the columns of Z after a rotation R of the network with ``stations`` stations."""
-    C = Z.copy()
-    blocks = C[: 4 * stations].reshape(stations, 4, -1)
-    blocks[:, :3] = R.T @ blocks[:, :3]
-    return np.asarray(C.T @ H @ C)
+def _undetermined(linear: Linear, given: _Given) -> MethodError:
+    """Return the error that names the freedoms which the distances leave undetermined."""
+    [T], G, D = linear.sums()
+    free = linear.problem.unknowns.target.freed[:, 0]
+    F = np.where(free[:, None, None], np.linalg.pinv(T, hermitian=True) @ G, 0.0)
+    D = D + np.diag(linear.border_prior()[0])
+    S = D - np.tensordot(G, F, axes=((0, 1), (0, 1)))
+    x = linear.at.tables
+    try:
+        determinacy.refuse_undetermined(
+            S, F, Stations(x[1][:, :3], x[1][:, 3]), x[0], free, given.start.position, DATUM_SAMPLE
+        )
+    except MethodError as error:
+        return error
+    return MethodError("The distances do not determine stations and targets. Distribute them more widely.")

@@ -12,10 +12,10 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import rigid_motions
-from errormotion.methods.multilateration.identification.refraction import index_uncertainty, sensitivities
-from errormotion.methods.multilateration.identification.uncertainty import Scatter
+from errormotion.methods.multilateration.identification.expansion import LABORATORY, causes, expansion_sources
+from errormotion.methods.multilateration.identification.uncertainty import Scatter, parts
 from errormotion.methods.multilateration.names import station_names, target_names
+from errormotion.methods.multilateration.network.model import Shared, Sources, directions
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.methods.multilateration.planning.sight import Sight
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 SETUPS = ("as set", "best")
 _COARSE = 4
 """Targets along each axis for the search of positions: the largest uncertainties are at the faces."""
-_AIR = (20.0, 101325.0, 0.5)
-"""Assumed temperature (degC), pressure (Pa) and humidity (1) of the air."""
 
 
 def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None) -> xr.Dataset:
@@ -69,7 +67,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     own = np.array(p.stations, np.float64)
     noise = reading_noise(settings)
     sees = sight.sees(own, target)
-    expected = bound(target, own, noise=noise, seen=sees)
+    expected = bound(target, own, noise=noise, seen=sees, sources=_sources_of(settings, position, target))
     sigma = layout.uncertainty(expected.target_covariance)
     if planning.targets is None:
         found = _best_stations(settings, planning, sight, own, expected)
@@ -79,13 +77,10 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
     if planning.write is not None:
         _write(planning.write, text)
-    names, groups, shared = _shared(settings, position, target)
-    names, groups, moves = _sources(settings, expected, names, groups, shared)
-    influence = np.concatenate([moves, np.zeros_like(moves)], axis=-1)
-    covariance = np.full((len(target), 6, 6), np.nan)
-    covariance[:, :3, :3] = expected.target_covariance + np.einsum("sia,sib->iab", shared, shared)
+    machine = 0.0 if settings.together else settings.repeatability or 0.0
+    of = parts(expected, 1.0, Scatter(p.displacement_noise, machine))
     if settings.together and settings.repeatability:  # one visit, common to all stations
-        covariance[:, :3, :3] += settings.repeatability**2 * np.eye(3)
+        of.covariance[:, :3, :3] += settings.repeatability**2 * np.eye(3)
     errors = np.zeros((len(target), 6))
     errors[:, 3:] = np.nan
     errors[~np.isfinite(sigma)] = np.nan
@@ -93,7 +88,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     coords = {name: ("target", position[:, i], m) for i, name in enumerate("xyz")}
     ds = build_errors(
         errors,
-        covariance,
+        of.covariance,
         dims=("target",),
         coords={
             **coords,
@@ -110,9 +105,9 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
         method=info.id,
         method_version=info.version,
         provenance=provenance.make(settings, None, None, steps=["plan"]),
-        influence=influence,
-        sources=names,
-        source_groups=groups,
+        influence=of.influence,
+        sources=of.names,
+        source_groups=of.groups,
         extras={
             "target_uncertainty": xr.DataArray(sigma, dims="target", attrs=m),
             "map_position": xr.DataArray(found.position, dims=("place", "direction"), attrs=m),
@@ -214,58 +209,18 @@ def _write(path: Path, text: str) -> None:
         ) from error
 
 
-def _sources(
-    settings: Settings, expected: Network, names: list[str], groups: list[str], shared: Array
-) -> tuple[list[str], list[str], Array]:
-    """Return the sources of the stations, by cause, followed by the shared ones."""
-    machine = 0.0 if settings.together else settings.repeatability or 0.0
-    shares, rows = Scatter(settings.layout.displacement_noise, machine).shares, expected.influence()
-    moves = [np.sqrt(share) * rows for share in shares.values()]
-    of = [
-        f"stations.{k}" if len(shares) == 1 else f"stations.{k} {group}" for group in shares for k in range(len(rows))
-    ]
-    return [*of, *names], [*(group for group in shares for _ in rows), *groups], np.concatenate([*moves, shared])
+def _sources_of(settings: Settings, position: Array, target: Array) -> Sources:
+    """Return what will be uncertain besides the noise, by the equations of the identification.
 
-
-def _shared(settings: Settings, position: Array, target: Array) -> tuple[list[str], list[str], Array]:
-    """Return the sources common to all readings, their groups, and their effects on the targets (source, m, 3), m.
-
-    A scale error of the lengths changes the size of the whole network, stations and dead paths included. An unknown
-    expansion of the scales changes the apparent size of the grid of targets.
+    Without a stated temperature of the scales, the one that will be measured is taken as the reference.
     """
-    centred = target - target.mean(axis=0)
-    air = settings.air
-    u = {
-        "temperature": air.temperature_uncertainty,
-        "pressure": air.pressure_uncertainty,
-        "humidity": air.humidity_uncertainty / 100,
-    }
-    index = index_uncertainty(sensitivities(*_AIR, air.co2, air.wavelength), u)
-    scales = {f"air {name}": ("air", float(abs(value))) for name, value in index.items()}
-    scales["wavelength"] = ("air", air.wavelength_uncertainty)
-    scales["scale of the tracker"] = ("tracker", settings.scale_or_assumed)
-    names = [name for name, (_, value) in scales.items() if value > 0]
-    groups = [scales[name][0] for name in names]
-    effects = [scales[name][1] * centred for name in names]
+    air = causes(*LABORATORY, settings.air.wavelength, settings.air)
+    scales: list[Shared] = []
     if (e := settings.expansion) is not None:
+        station = np.array(settings.layout.stations, np.float64)
         warmer = 0.0 if e.temperature is None else e.temperature - e.reference
-        strains = {"expansion coefficient": np.full(3, e.coefficient_uncertainty * warmer)}
-        strains |= {
-            f"temperature of {axis} scale": e.coefficient * e.temperature_uncertainty * np.eye(3)[k]
-            for k, axis in enumerate("XYZ")
-        }
-        strains = {name: strain for name, strain in strains.items() if strain.any()}
-        names += list(strains)
-        groups += ["expansion"] * len(strains)
-        effects += [_without_motion(-strain * position, target) for strain in strains.values()]
-    return names, groups, np.array(effects).reshape(-1, *target.shape)
-
-
-def _without_motion(change: Array, target: Array) -> Array:
-    """Return a change (m, 3) of the targets minus its best-fit rigid motion."""
-    G = rigid_motions(target, target.mean(axis=0)).reshape(-1, 6)
-    left = change.ravel() - G @ np.linalg.lstsq(G, change.ravel())[0]
-    return np.asarray(left.reshape(change.shape))
+        scales = expansion_sources(np.full((len(station), 3), warmer), position, directions(target, station), e)
+    return Sources(air, {"tracker scale": settings.scale_or_assumed}, scales)
 
 
 def _notes(

@@ -132,8 +132,8 @@ class Volume:
             k: number of candidates, the first of the positions.
         """
         n, k = len(station), len(point)
-        stations = Stations(station, np.zeros(n), np.zeros(0))
-        e = directions(point, stations).transpose(1, 0, 2)
+        stations = Stations(station, np.zeros(n))
+        e = directions(point, station).transpose(1, 0, 2)
         fine = sees.sum(axis=0) >= 3
         w = np.where(sees.T & fine[:, None], 1.0 / noise, 0.0)
         Q = np.zeros((k, n, 4 * n))
@@ -150,7 +150,7 @@ class Volume:
             fine = fine & (np.linalg.cond(A) < 1e12)
             A[~fine] = np.eye(3)
             D = np.where(fine[:, None, None], np.linalg.inv(A), 0.0)
-            basis = _without_motions(stations.motions(centre))
+            basis = _without_motions(stations.motions(centre).reshape(4 * n, 6))
             Q = Q @ basis
             F = -D @ np.einsum("kja,kjp->kap", E, Q)
             rows = np.where(fine[:, None, None], Q + E @ F, 0.0)

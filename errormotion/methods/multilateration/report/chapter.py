@@ -201,10 +201,7 @@ def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
         ("noise of a reading, as used / µm", fixed(1e6 * net.noise, 2)),
         ("ratio of the scatter to the stated one", fixed(scalar(errors, "sigma0"), 3)),
         ("readings minus unknowns", integer(scalar(errors, "freedom"))),
-        ("iterations", integer(scalar(errors, "iterations"))),
         ("condition of the determined freedoms", significant(scalar(errors, "condition"), 3)),
-        ("iterations of the alternating scheme", integer(scalar(errors, "alternating_iterations"))),
-        ("its estimated remaining error / µm", fixed(1e6 * scalar(errors, "alternating_left"), 3)),
         ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
         ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
     ]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.network.model import Stations
 
 MAX_SHARE = 0.05
@@ -31,16 +32,11 @@ _LISTED = 12
 _SHARE = 0.1
 
 
-def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], unknown: int) -> None:
-    """Raise MethodError if there are fewer readings than unknowns.
-
-    Parameters
-    ----------
-    by_target, by_station : ndarray (m,), (n,)
-        Number of readings of each target and from each station.
-    unknown : int
-        Number of parameters of the stations without prior knowledge.
-    """
+def refuse_too_few(reading: Array) -> None:
+    """Raise MethodError if there are fewer readings (n, m) than unknowns of the stations."""
+    known = np.isfinite(reading)
+    by_target = known.sum(axis=0)
+    by_station = (known & (by_target >= 3)).sum(axis=1)
     n, m = len(by_station), len(by_target)
     if n < 4:
         raise MethodError(
@@ -55,7 +51,7 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
             "from it, or remove the station."
         )
     count = by_target
-    equations, needed = int(np.maximum(count - 3, 0).sum()), unknown - 6
+    equations, needed = int(np.maximum(count - 3, 0).sum()), 4 * n - 6
     if equations < needed:
         full = -(-needed // (n - 3))
         raise MethodError(
@@ -66,9 +62,9 @@ def refuse_too_few(by_target: NDArray[np.int64], by_station: NDArray[np.int64], 
         )
 
 
-def refuse_not_finite(*sums: Array) -> None:
-    """Raise MethodError if sums over the targets are not finite."""
-    if not all(np.isfinite(each).all() for each in sums):
+def refuse_not_finite(*values: Array) -> None:
+    """Raise MethodError if values by distances and noise are not finite."""
+    if not all(np.isfinite(each).all() for each in values):
         raise MethodError(
             "Expected distances between stations and targets, and a noise, that are not zero; found one of zero, or "
             "not finite. Check positions and noise, and that both are in metres."
@@ -76,20 +72,22 @@ def refuse_not_finite(*sums: Array) -> None:
 
 
 def refuse_undetermined(
-    information: Array, basis: Array, stations: Stations, target: Array, approximate: Array
+    S: Array, F: Array, stations: Stations, target: Array, in_datum: NDArray[np.bool_], approximate: Array, most: int
 ) -> Array:
-    """Return the eigenvalues of the information, scaled to a diagonal of 1.
+    """Return the eigenvalues of the stations' information without rigid motions, scaled to a diagonal of 1.
 
     Parameters
     ----------
-    information : ndarray (p, p)
-        1/m^2, within the columns of ``basis``.
-    basis : ndarray (4 n + k, p)
-        In the datum of the targets, in which a single undetermined station moves alone.
+    S : ndarray (q, q)
+        Information of the stations' parameters and of further ones, 1/m^2.
+    F : ndarray (m, 3, q)
+        Negative motion of the targets by these parameters, m.
     stations : Stations
         As estimated.
     target : ndarray (m, 3)
         As estimated, m.
+    in_datum : ndarray of bool (m,)
+        Targets that define the datum. In the datum of ``most`` of these an undetermined station moves alone.
     approximate : ndarray (n, 3)
         Approximate positions of the stations, m: the estimated ones are wrong if a freedom is undetermined.
 
@@ -98,19 +96,36 @@ def refuse_undetermined(
     MethodError
         A freedom is undetermined.
     """
-    refuse_not_finite(information)
-    values, motions, sigma, undetermined = freedoms(information, basis, stations.position, target)
+    refuse_not_finite(S, target)
+    some = np.flatnonzero(in_datum)
+    some = some[:: max(1, len(some) // most)]
+    information, basis = without_motions(S, F[some], stations, target[some])
+    values, motions, sigma, undetermined = freedoms(information, basis, stations.position, target[some])
     if not undetermined.any():
         return values
-    centre = target.mean(axis=0)
+    centre = target[some].mean(axis=0)
     k = int(np.count_nonzero(undetermined))
     named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(undetermined)[:_DESCRIBED])
     worst = sigma[0] if values[0] > ROUNDING * values[-1] else np.inf
     raise MethodError(
         f"Expected positions of stations and targets that the distances determine; found {k} "
         f"undetermined {'freedom' if k == 1 else 'freedoms'} (standard uncertainty {_length(worst)}): {named}. "
-        f"Cause: {_reason(approximate, target)}."
+        f"Cause: {_reason(approximate, target[some])}."
     )
+
+
+def without_motions(S: Array, F: Array, stations: Stations, target: Array) -> tuple[Array, Array]:
+    """Return the information (q - 6, q - 6) within the complement of rigid motions, and its columns (q, q - 6).
+
+    The columns are in the datum of the targets (m, 3), which move by -F (m, 3, q).
+    """
+    q, centre = len(S), target.mean(axis=0)
+    T = np.zeros((q, 6))
+    T[: 4 * len(stations.position)] = stations.motions(centre).reshape(-1, 6)
+    size = np.linalg.norm(T, axis=0)
+    Z = np.linalg.qr(T / np.where(size > 0, size, 1.0), mode="complete")[0][:, 6:]
+    G = rigid_motions(target, centre).reshape(-1, 6)
+    return Z.T @ S @ Z, Z - T @ np.linalg.lstsq(G, -F.reshape(len(G), q) @ Z)[0]
 
 
 def freedoms(
@@ -232,7 +247,10 @@ def without_position(weight: Array, named: tuple[int, ...]) -> list[str]:
     few = np.setdiff1d(np.flatnonzero(np.count_nonzero(weight, axis=0) < 3), named)
     if not len(few):
         return []
-    return [f"Targets with fewer than three valid readings, without a position ({len(few)}): {_listed(few)}."]
+    return [
+        "Targets with fewer than three valid readings, or in one plane with their stations, without a position "
+        f"({len(few)}): {_listed(few)}."
+    ]
 
 
 def _listed(targets: NDArray[np.intp]) -> str:

@@ -39,13 +39,9 @@ class Outliers:
     out: NDArray[np.bool_] = field(compare=False, repr=False)
 
     @classmethod
-    def none(cls, weight: Array) -> Outliers:
-        """Return no outliers, for weights (n, m)."""
-        return cls((), (), np.zeros(weight.shape, dtype=bool))
-
-    def applied(self, weight: Array) -> Array:
-        """Return the weights (n, m), 0 for excluded readings."""
-        return np.where(self.out, 0.0, weight)
+    def none(cls, reading: Array) -> Outliers:
+        """Return no outliers, for readings (n, m)."""
+        return cls((), (), np.zeros(reading.shape, dtype=bool))
 
 
 def notes(left_out: tuple[tuple[int, int], ...], undecided: tuple[int, ...]) -> list[str]:
@@ -78,7 +74,7 @@ def gate(t: Array) -> float:
     return -scale * float(ndtri(0.5 * FALSE_ALARMS / max(int(np.count_nonzero(np.isfinite(t))), 1)))
 
 
-def gross(reading: Array, weight: Array, nominal: Array, position: Array, dead_path: Array) -> Outliers:
+def gross(reading: Array, nominal: Array, position: Array, dead_path: Array) -> Outliers:
     """Return the gross outliers of readings (n, m), by the distances from nominal targets (m, 3).
 
     These differ from the distances to the approximate stations (n, 3), with their dead paths (n,), by far more than
@@ -87,20 +83,17 @@ def gross(reading: Array, weight: Array, nominal: Array, position: Array, dead_p
     off = np.empty_like(reading)
     for j in range(len(reading)):
         off[j] = np.abs(np.linalg.norm(nominal - position[j], axis=1) - dead_path[j] - reading[j])
-    off[weight == 0] = np.nan
     out = off > _GROSS * np.nanmedian(off, axis=1, keepdims=True)
     return Outliers(tuple((int(j), int(i)) for j, i in np.argwhere(out)), (), out)
 
 
-def search(network: Network, weight: Array, nominal: Array, before: Outliers) -> Outliers:
+def search(network: Network, nominal: Array, before: Outliers) -> Outliers:
     """Return the known outliers and the largest of those that remain.
 
     Parameters
     ----------
     network : Network
         Solution without the known outliers.
-    weight : ndarray (n, m)
-        Of all readings, outliers included.
     nominal : ndarray (m, 3)
         Nominal targets, m.
     before : Outliers
@@ -125,7 +118,9 @@ def search(network: Network, weight: Array, nominal: Array, before: Outliers) ->
     out[which[found], targets[found]] = True
     out[:, targets[~found]] = True
     left_out = before.left_out + tuple(
-        (int(j), int(i)) for j, i in zip(which[found], targets[found], strict=True) if weight[j, i] > 0
+        (int(j), int(i))
+        for j, i in zip(which[found], targets[found], strict=True)
+        if np.isfinite(network.reading[j, i])
     )
     return Outliers(left_out, tuple(sorted({*before.undecided, *(int(i) for i in targets[~found])})), out)
 
@@ -144,8 +139,8 @@ def _by_positions(network: Network, nominal: Array, targets: NDArray[np.intp]) -
     deviation = network.target - nominal
     usual = np.nanmedian(deviation, axis=0)
     spread = NORMAL_MAD * np.nanmedian(np.abs(deviation - usual), axis=0)
-    own, _, _ = network.blocks(targets)
-    e = directions(network.target[targets], network.stations)
+    own = network.fit.normal.own[targets]
+    e = directions(network.target[targets], network.station)
     w, r, share = network.weight[:, targets], network.residual[:, targets], network.redundancy[:, targets]
     with np.errstate(invalid="ignore", divide="ignore"):
         moved = (

@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.model import Stations, directions
+from errormotion.methods.multilateration.network.diagnosis.determinacy import refuse_not_finite
+from errormotion.methods.multilateration.network.model import directions
 from errormotion.methods.multilateration.network.start import initial_stations
 
+FLAT = 1e-10
+"""Determinant of the products of a target's directions, over the cube of their trace, without a position."""
 _SAMPLE = 1000
 
 if TYPE_CHECKING:
@@ -42,12 +45,25 @@ def weak_targets(displacement: Array, nominal: Array, station: Array | None, noi
     if not fixed.any():
         return np.zeros(len(nominal), dtype=bool)
     position = initial_stations(np.nan_to_num(displacement), weight, nominal, station).position
-    e = directions(nominal, Stations(position, np.zeros(len(position)), np.zeros(0)))
+    e = directions(nominal, position)
     information = np.einsum("jt,jta,jtb->tab", weight**2, e, e)
     values = np.linalg.eigvalsh(information)
     with np.errstate(divide="ignore"):
         u = np.sqrt((1 / np.maximum(values, 0.0)).sum(axis=1))
     return np.asarray(fixed & ~(u <= _limit(len(nominal)) * float(np.median(u[fixed]))), dtype=bool)
+
+
+def unlocated(reading: Array, sd: Array, target: Array, position: Array) -> NDArray[np.bool_]:
+    """Return which targets (m,) have fewer than three readings (n, m), or lie in one plane with their stations."""
+    known = np.isfinite(reading)
+    few = known.sum(axis=0) < 3
+    with np.errstate(all="ignore"):
+        E = np.where(known, 1.0 / sd, 0.0)[:, :, None] * directions(target, position)
+        A = np.einsum("jta,jtb->tab", E, E)
+    refuse_not_finite(A[~few])
+    A[few] = np.eye(3)
+    pivots = np.linalg.det(A) / np.trace(A, axis1=1, axis2=2) ** 3
+    return np.asarray(few | ~(pivots > FLAT))
 
 
 def datum_targets(traces: Array) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Alternating scheme of the paper: stations from targets and targets from stations, relative to the first target.
+"""Published schemes for comparison: stations and targets alternately, and dead paths from the first target.
 
 Takeuchi et al., section 2.2, equations (6) and (7), with L_j = |u_1 - U_j|. The position of the first target is fixed,
 all others are relative to it. Each half of an iteration is a set of least-squares problems of three unknowns. The
@@ -10,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+import scipy.sparse as sp
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.model import Stations
-from errormotion.methods.multilateration.network.rigid_motion import fitted
+from errormotion.methods.multilateration.network.model import Shared, Sources, Stations, directions
+from errormotion.methods.multilateration.network.network import Network
+from errormotion.methods.multilateration.planning.bound import bound
 
 TOLERANCE = 1e-9
 _HALF_STEPS = 2
@@ -104,9 +106,9 @@ def alternate(
         if moved < tolerance:
             break
     r = d - (np.linalg.norm(u - U[:, None], axis=-1) - np.linalg.norm(u[0] - U, axis=1)[:, None])
-    stations, u, _ = fitted(Stations(U, np.zeros(len(U)), np.zeros(0)), u, nominal, np.ones(len(u), dtype=bool))
+    u, U = fitted(u, U, nominal)
     return Alternated(
-        u, stations.position, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2)))
+        u, U, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2)))
     )
 
 
@@ -133,3 +135,49 @@ def _targets(reach: Array, u: Array, U: Array) -> Array:
     b = np.einsum("jia,ji->ia", e, reach - distance)
     moved: Array = u + np.linalg.solve(A, b[..., None])[..., 0]
     return moved
+
+
+def fitted(target: Array, station: Array, nominal: Array) -> tuple[Array, Array]:
+    """Return targets (m, 3) and stations (n, 3) moved to the best fit of the targets to the nominal ones."""
+    a, b = target.mean(axis=0), nominal.mean(axis=0)
+    U, _, Vt = np.linalg.svd((nominal - b).T @ (target - a))
+    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
+    R = U @ Vt
+    return (target - a) @ R.T + b, (station - a) @ R.T + b
+
+
+def relative_bound(target: Array, station: Array, *, noise: float, first: int = 0) -> tuple[Array, Network]:
+    """Return the covariances (m, 3, 3) of the formulation relative to one target, and the network with those it states.
+
+    It assumes the readings of that target to be exact: their noise affects all results, but is not in the stated
+    covariance.
+    """
+    sd = np.full((len(station), len(target)), noise)
+    sd[:, first] *= 1e-3
+    changes = np.zeros((len(station), *sd.shape))
+    changes[np.arange(len(station)), np.arange(len(station)), first] = noise
+    sources = Sources(scales=[Shared(f"station {j + 1}", "first target", each) for j, each in enumerate(changes)])
+    stated = bound(target, station, noise=sd, sources=sources)
+    return stated.moved.errors.covariance, stated
+
+
+def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.csr_array:
+    """Return the sparse derivatives of the known readings by (u_1, ..., u_m, U_1, L_1, ..., U_n, L_n).
+
+    Parameters
+    ----------
+    target : ndarray (m, 3)
+        m.
+    stations : Stations
+    known : ndarray (n, m)
+        Rows of the result: by target, then by station.
+    """
+    n, m = known.shape
+    e = directions(target, stations.position).transpose(1, 0, 2)
+    values = np.concatenate([e, -e, np.full((m, n, 1), -1.0)], axis=-1)
+    i, j = np.arange(m)[:, None, None], np.arange(n)[None, :, None]
+    columns = np.concatenate(np.broadcast_arrays(3 * i + np.arange(3), 3 * m + 4 * j + np.arange(3)), axis=-1)
+    columns = np.concatenate([columns, np.broadcast_to(3 * m + 4 * j + 3, (m, n, 1))], axis=-1)
+    some = known.T
+    rows = 7 * np.arange(np.count_nonzero(some) + 1)
+    return sp.csr_array((values[some].ravel(), columns[some].ravel(), rows), shape=(len(rows) - 1, 3 * m + 4 * n))
