@@ -107,9 +107,7 @@ def alternate(
             break
     r = d - (np.linalg.norm(u - U[:, None], axis=-1) - np.linalg.norm(u[0] - U, axis=1)[:, None])
     u, U = fitted(u, U, nominal)
-    return Alternated(
-        u, U, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2)))
-    )
+    return Alternated(u, U, done, moved < tolerance, moved, min(rate, 1.0), float(np.sqrt(np.mean(r**2))))
 
 
 def _stations(d: Array, u: Array, U: Array) -> Array:
