@@ -77,7 +77,10 @@ class Table:
             return np.asarray(table[self.index])
         if self.weight is None:
             return np.asarray(table[self.index])
-        return np.asarray(np.einsum("nw,nwk->nk", self.weight, table[self.index]))
+        found = self.weight[:, :1] * table[self.index[:, 0]]
+        for slot in range(1, self.slots):
+            found += self.weight[:, slot, None] * table[self.index[:, slot]]
+        return np.asarray(found)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -190,6 +193,13 @@ class Noise:
     def __post_init__(self) -> None:
         if (self.sd is None) == (self.root is None):
             raise FitError("expected either sd or root of the noise")
+
+    def effect(self, L: Array) -> Array:
+        """Return the effect of independent noise of unit size on residuals with derivatives L (n, m, r), (n, m, k)."""
+        if self.root is not None:
+            return np.asarray(L @ self.root)
+        sd = np.asarray(self.sd, dtype=float)
+        return np.asarray(L * (sd[:, None, None] if sd.ndim == 1 else sd[:, None, :]))
 
     def covariance(self, shape: tuple[int, int]) -> Array:
         """Return the covariance of the numbers of each reading, (n, r, r)."""

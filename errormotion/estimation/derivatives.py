@@ -27,7 +27,12 @@ def column(values: Array) -> Array:
 
 
 def by_rows(
-    equation: Callable[[list[Array]], Array], tables: Sequence[Table], values: Sequence[Array], which: Sequence[int]
+    equation: Callable[[list[Array]], Array],
+    tables: Sequence[Table],
+    values: Sequence[Array],
+    which: Sequence[int],
+    *,
+    weighed: bool = True,
 ) -> list[Array]:
     """Return the derivatives by the rows of some tables.
 
@@ -40,6 +45,8 @@ def by_rows(
         Their values.
     which : sequence of int
         The tables to differentiate by.
+    weighed : bool
+        Whether the derivatives by a sum of rows are those by each row; otherwise by the sum, w = 1.
 
     Returns
     -------
@@ -64,7 +71,7 @@ def by_rows(
                 parts.append(_difference(equation, rows, k, at, float(steps[col])))
         J = np.stack(parts, axis=-1)
         J = J.reshape(*J.shape[:2], slots, width)
-        if summed and table.weight is not None:
+        if weighed and summed and table.weight is not None:
             J = J * table.weight[:, None, :, None]
         found.append(J)
     return found

@@ -17,10 +17,8 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.estimation.blocks import Block
-from errormotion.estimation.derivatives import column
 from errormotion.estimation.normal import Normal, SingularError
-from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised, problem_block
+from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised, white_of
 
 __all__ = ["Fit", "fit"]
 
@@ -33,9 +31,6 @@ STALLED = 1e-10
 """Newton decrement below which a step that gains no further digit is due to rounding."""
 MAX_ITERATIONS = 50
 HALVINGS = 20
-EPS = float(np.finfo(float).eps)
-OPERATIONS = 8.0
-"""Rounding errors of a residual, in units of those of the readings and unknowns in it."""
 ROUNDING = 1e-12
 """Increase of Q, relative to Q, that is regarded as rounding."""
 _ROWS = 4096
@@ -107,31 +102,25 @@ class Fit:
         linear, normal = self.linear, self.normal
         n, m = linear.used.shape
         found = np.zeros((n, m, m))
-        b = linear.columns.shape[1]
-        root = np.concatenate([normal.root, np.zeros((1, normal.root.shape[1]))])
         # J C J' = J_L own J_L' + E E' with E = (J_B - J_L F) root
         for first in range(0, n, _ROWS):
-            part = slice(first, first + _ROWS)
-            E = np.einsum("nmb,nbr->nmr", linear.border[part], root[linear.columns[part]]) if b else 0.0
-            if linear.numbering.local is not None:
-                index = linear.problem.unknowns[linear.numbering.local].index2[part]
-                E = E + np.einsum("nmwp,nwpr->nmr", linear.local[part], normal.shared[index])
-            if np.ndim(E):
-                found[part] += E @ np.swapaxes(E, 1, 2)
+            rows = np.arange(first, min(first + _ROWS, n))
+            E = linear.effect(normal.shared, normal.root, rows)
+            found[rows] = E @ np.swapaxes(E, 1, 2)
         if linear.numbering.local is not None:
             found += self._local_hat()
         return found
 
     def _local_hat(self) -> Array:
-        linear = self.linear
-        block: Block = linear.problem.unknowns[linear.numbering.local]
-        index, w = block.index2, linear.local.shape[2]
-        found = np.zeros((*linear.used.shape, linear.used.shape[1]))
+        linear, groups = self.linear, self.linear.numbering.of_local
+        rows, A = linear.numbering.rows[groups.first], linear.local_matrix
+        w, p = linear.local.shape[2:]
+        C = np.empty((len(rows), w, p, w, p))
         for i in range(w):
             for j in range(w):
-                C = self.normal.local_covariance(index[:, i], index[:, j])
-                found += linear.local[:, :, i] @ C @ np.swapaxes(linear.local[:, :, j], 1, 2)
-        return found
+                C[:, i, :, j] = self.normal.local_covariance(rows[:, i], rows[:, j])
+        AC = groups.spread(groups.each(A) @ C.reshape(-1, w * p, w * p), A.shape[1])
+        return np.asarray(AC @ np.swapaxes(A, 1, 2))
 
 
 def fit(
@@ -161,7 +150,7 @@ def fit(
     """
     number = Numbering.of(problem)
     at = problem.start if start is None else start
-    last = np.inf
+    last = before = np.inf
     for _ in range(MAX_ITERATIONS):
         linear = linearised(problem, at, number)
         normal, step, decrement = _step(linear, what)
@@ -169,11 +158,13 @@ def fit(
         unit = _unit(linear)
         if refresh is not None:
             problem = refresh(problem, type(problem.unknowns)(*at.tables))
-        if decrement <= max(DECREMENT * unit, _rounding(linear)):
+        # The next decrement, if it decreases as slowly as before
+        expected = decrement * max(decrement / last, last / before) if np.isfinite(before) else decrement
+        if min(decrement, expected) <= max(DECREMENT * unit, linear.rounding):
             break
         if decrement > 0.1 * last and decrement <= STALLED * unit:
             break
-        last = decrement
+        last, before = decrement, last
     else:
         raise FitError(
             f"the fit to {what} has not converged after {MAX_ITERATIONS} iterations (the next step would still "
@@ -199,7 +190,7 @@ def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
     """Return the unknowns after the step, or after the largest half of it that does not increase the sum."""
     before = linear.chi2 + linear.prior_square()
     # Residuals r with errors d of rounding have the sum r'r + 2 r'd.
-    most = before * (1 + ROUNDING) + ROUNDING + 2 * np.sqrt(before * _rounding(linear))
+    most = before * (1 + ROUNDING) + ROUNDING + 2 * np.sqrt(before * linear.rounding)
     fraction = 1.0
     for _ in range(HALVINGS):
         at = linear.moved(fraction * step[0], fraction * step[1])
@@ -220,30 +211,13 @@ def _square(linear: Linear, at: Unknown) -> float:
 def _whitened(linear: Linear) -> Array:
     """Return the residuals in units of their noise, (n, m); 0 where missing."""
     raw = np.where(linear.used, linear.problem.residuals(linear.at), 0.0)
-    return np.asarray((linear.whitener @ raw[..., None])[..., 0])
+    return white_of(linear.whitener, raw)
 
 
 def _unit(linear: Linear) -> float:
     """Return the variance factor of the readings, at least that of the rounding of their numbers."""
     used = max(int(linear.used.sum()), 1)
-    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, _rounding(linear) / used)
-
-
-def _rounding(linear: Linear) -> float:
-    """Return the sum of squares of the errors in the whitened residuals by rounding of readings and unknowns."""
-    noise, number = linear.problem.noise, linear.numbering
-    y = np.abs(column(linear.problem.y))
-    if noise.sd is None:
-        size = np.abs(linear.whitener).sum(axis=2) * y.max(axis=1, initial=0.0, keepdims=True)
-    else:
-        # A number with the standard deviation s contributes at most y / s.
-        sd = column(np.asarray(noise.sd, dtype=float))
-        most = np.max(y / np.where(sd > 0, sd, np.inf), axis=1, initial=0.0, keepdims=True)
-        size = np.where(linear.used, most, 0.0)
-    if number.local is not None:
-        table = np.abs(linear.at.tables[number.local])
-        size += np.einsum("nmwp,nwp->nm", np.abs(linear.local), table[problem_block(linear).index2])
-    return float(np.sum(np.square(OPERATIONS * EPS * size)))
+    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, linear.rounding / used)
 
 
 def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:

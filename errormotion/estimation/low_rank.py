@@ -158,7 +158,7 @@ def _roots(D: Array) -> tuple[Array, NDArray[np.intp], Array, float]:
     root, log_determinant = np.empty_like(D), 0.0
     plain = np.asarray((np.diagonal(D, axis1=1, axis2=2) > PLAIN).all(axis=1))
     try:
-        inverse = _inverse(np.asarray(np.linalg.cholesky(D[plain]), dtype=float))
+        inverse = inverse_of_lower(np.asarray(np.linalg.cholesky(D[plain]), dtype=float))
     except np.linalg.LinAlgError:
         plain[:] = False
     else:
@@ -175,7 +175,7 @@ def _roots(D: Array) -> tuple[Array, NDArray[np.intp], Array, float]:
     return root, rest[weak], vectors[weak, :, column], log_determinant + float(np.log(power[strong]).sum())
 
 
-def _inverse(L: Array) -> Array:
+def inverse_of_lower(L: Array) -> Array:
     """Return the inverses of lower triangular matrices (n, d, d), row by row: a third of the time of a general one."""
     found = np.zeros_like(L)
     reciprocal = 1 / np.diagonal(L, axis1=1, axis2=2)

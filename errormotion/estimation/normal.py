@@ -20,6 +20,7 @@ from scipy.linalg import lapack
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
+from errormotion.estimation.low_rank import inverse_of_lower
 
 __all__ = ["Normal", "SingularError", "factorised"]
 
@@ -52,10 +53,19 @@ class Normal:
     F: Array
     S: Array
     root: Array
-    _inverses: Array  # (B, s p, s p): diagonal blocks of T^-1
     _pivots: Array  # (B, s p, s p): inverse pivots P_k^-1 of the blocks of s rows
     _back: Array  # (B - 1, s p, s p): P_k^-1 times the coupling C_k with the next block
     _G: Array
+
+    @cached_property
+    def _inverses(self) -> Array:
+        """Diagonal blocks of T^-1, (B, s p, s p)."""
+        return _inverses(self._pivots, self._back)
+
+    @cached_property
+    def _beside(self) -> Array:
+        """Blocks of T^-1 beside the diagonal, (B - 1, s p, s p): -P_k^-1 C_k (T^-1)_(k+1,k+1)."""
+        return np.asarray(-(self._back @ self._inverses[1:]))
 
     @cached_property
     def own(self) -> Array:
@@ -71,8 +81,7 @@ class Normal:
         block, to = i // s, j // s
         found = parts[block, i % s, :, j % s]
         if self._back.any():
-            # (T^-1)_(k,k+1) = -P_k^-1 C_k (T^-1)_(k+1,k+1)
-            beside = -(self._back @ self._inverses[1:]).reshape(-1, s, p, s, p)
+            beside = self._beside.reshape(-1, s, p, s, p)
             for k, sign in ((np.flatnonzero(to == block + 1), 1), (np.flatnonzero(to == block - 1), -1)):
                 low, inside, outside = (block, i, j) if sign > 0 else (to, j, i)
                 one = beside[low[k], inside[k] % s, :, outside[k] % s]
@@ -105,6 +114,15 @@ class Normal:
         z = self.root @ (self.root.T @ (b - np.tensordot(self._G, y, axes=((0, 1), (0, 1)))))
         return y - self.F @ z, z
 
+    def square(self, a: Array, b: Array) -> Array:
+        """Return ``(a, b)' C (a, b)`` with the covariance C of all unknowns, (k, k), for (R, p, k) and (q, k)."""
+        # a' T^-1 a by the pivots of the elimination, and what the border adds
+        right = _forward(self._back, _in_blocks(a, self._pivots))
+        k = a.shape[2]
+        white = self.root.T @ (b - np.tensordot(self.F, a, axes=((0, 1), (0, 1))))
+        inner = right.reshape(-1, k).T @ (self._pivots @ right).reshape(-1, k)
+        return np.asarray(inner + white.T @ white)
+
 
 def factorised(band: Sequence[Array], G: Array, D: Array, gauge: Array | None = None) -> Normal:
     """Factorise normal equations.
@@ -130,7 +148,7 @@ def factorised(band: Sequence[Array], G: Array, D: Array, gauge: Array | None = 
     F = _swept(pivots, back, G)
     S = D - np.tensordot(G, F, axes=((0, 1), (0, 1)))
     S = (S + S.T) / 2
-    return Normal(F, S, _root(S, D, gauge), _inverses(pivots, back), pivots, back, G)
+    return Normal(F, S, _root(S, D, gauge), pivots, back, G)
 
 
 def _superblocks(band: Sequence[Array], R: int, p: int, s: int, blocks: int) -> tuple[Array, Array]:
@@ -174,19 +192,27 @@ def _eliminated(diagonal: Array, after: Array, s: int, R: int) -> tuple[Array, A
 
 
 def _chained(diagonal: Array, after: Array, s: int, R: int) -> tuple[Array, Array]:
-    """Return the inverse pivots and their products with the coupling, one block after the other."""
-    inverse, back = np.empty_like(diagonal), np.empty_like(after)
-    pivot = diagonal[0]
-    for k in range(len(diagonal)):
-        factor, failed = lapack.dpotrf(pivot, lower=1)
-        if failed or np.square(np.diagonal(factor)).min(initial=1.0) <= SINGULAR:
-            raise _singular(np.array([k]), s, R)
-        half = lapack.dpotri(factor, lower=1)[0]
-        inverse[k] = np.tril(half) + np.tril(half, -1).T
-        if k < len(after):
-            back[k] = inverse[k] @ after[k]
-            pivot = diagonal[k + 1] - after[k].T @ back[k]
-    return inverse, back
+    """Return the inverse pivots and their products with the coupling, from the Cholesky factor of the whole band."""
+    count, size = diagonal.shape[:2]
+    # A column of the band: its part of a diagonal block from the diagonal on, and the coupling below
+    columns = np.zeros((count, 3 * size, size))
+    columns[:, :size] = diagonal
+    columns[:-1, size : 2 * size] = np.swapaxes(after, 1, 2)
+    c = np.arange(size)
+    below = c[:, None] + np.arange(2 * size)
+    band = np.where(below < 2 * size, columns[:, below, c[:, None]], 0.0).reshape(count * size, 2 * size)
+    factor, failed = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
+    L = np.zeros((count, 3 * size, size))
+    L[:, below, c[:, None]] = factor.T.reshape(count, size, 2 * size)
+    pivots = np.tril(L[:, :size])
+    done = (failed - 1) // size if failed > 0 else count
+    smallest = np.square(np.diagonal(pivots[:done], axis1=1, axis2=2)).min(axis=1, initial=1.0)
+    bad = np.append(np.flatnonzero(smallest <= SINGULAR), np.arange(done, count))
+    if bad.size:
+        raise _singular(bad[:1], s, R)
+    # P_k = L_k L_k', C_k = L_k M_k' with the block M_k of the factor below
+    half = inverse_of_lower(pivots)
+    return np.swapaxes(half, 1, 2) @ half, np.swapaxes(half[:-1], 1, 2) @ np.swapaxes(L[:-1, size : 2 * size], 1, 2)
 
 
 def _inverted(matrices: Array, s: int, R: int) -> Array:
@@ -221,18 +247,30 @@ def _inverses(pivots: Array, back: Array) -> Array:
 def _swept(pivots: Array, back: Array, a: Array) -> Array:
     """Return ``T^-1 a`` for (R, p, k)."""
     R, p, k = a.shape
+    y = pivots @ _forward(back, _in_blocks(a, pivots))
+    if back.any():
+        for j in range(len(pivots) - 2, -1, -1):
+            y[j] -= back[j] @ y[j + 1]
+    return np.asarray(y.reshape(y.shape[0] * y.shape[1] // max(p, 1), p, k)[:R])
+
+
+def _in_blocks(a: Array, pivots: Array) -> Array:
+    """Return right sides (R, p, k) by block, (B, s p, k); 0 beyond the last row."""
+    R, p, k = a.shape
     size = pivots.shape[1] if len(pivots) else p
-    rows = len(pivots) * size // p
-    right = np.concatenate([a, np.zeros((rows - R, p, k))]).reshape(len(pivots), size, k)
+    missing = len(pivots) * size // max(p, 1) - R
+    whole = np.concatenate([a, np.zeros((missing, p, k))]) if missing else a
+    return whole.reshape(len(pivots), size, k)
+
+
+def _forward(back: Array, right: Array) -> Array:
+    """Return right sides after the elimination of the blocks before each."""
     if not back.any():
-        return np.asarray((pivots @ right).reshape(rows, p, k)[:R])
-    right = right.copy()
-    for j in range(1, len(pivots)):
-        right[j] -= back[j - 1].T @ right[j - 1]
-    y = pivots @ right
-    for j in range(len(pivots) - 2, -1, -1):
-        y[j] -= back[j] @ y[j + 1]
-    return np.asarray(y.reshape(rows, p, k)[:R])
+        return right
+    found = right.copy()
+    for before, after, coupling in zip(found[:-1], found[1:], np.swapaxes(back, 1, 2), strict=True):
+        after -= coupling @ before
+    return found
 
 
 def _root(S: Array, D: Array, gauge: Array | None) -> Array:

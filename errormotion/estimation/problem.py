@@ -14,12 +14,16 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation.blocks import Block, Constant, Index, Noise, Table
 from errormotion.estimation.derivatives import along, by_rows, column
+from errormotion.estimation.groups import Groups, Layout, labels, products, rows_summed
 from errormotion.estimation.normal import Normal, factorised
 
-__all__ = ["READINGS", "Linear", "Problem", "by_slot", "linearised"]
+__all__ = ["READINGS", "Linear", "Problem", "by_slot", "linearised", "white_of"]
 
 READINGS = "readings"
 """Name of the derivatives by the readings among analytic ones."""
+_EPS = float(np.finfo(float).eps)
+OPERATIONS = 8.0
+"""Rounding errors of a residual, in units of those of the readings and unknowns in it."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,7 +105,10 @@ class Problem:
     def residuals(self, at: Unknown) -> Array:
         """Return the residuals (n, m); NaN where a reading is missing."""
         values = [*at.tables, *self.constant_tables(at)]
-        rows = [table.rows(value) for table, value in zip(self.tables, values, strict=True)]
+        return self.known([table.rows(value) for table, value in zip(self.tables, values, strict=True)])
+
+    def known(self, rows: list[Array]) -> Array:
+        """Return the residuals for rows, (n, m); NaN where a reading is missing."""
         found = column(self.evaluate(self.y, rows))
         missing = ~np.isfinite(column(self.readings))
         if not missing.any():
@@ -140,6 +147,12 @@ class Numbering:
         q, the size of the border.
     band : int
         How many rows further the coupling of the local block reaches; 0 = none.
+    rows : ndarray of int, (n, w)
+        Rows of the local block that each reading sees; w = 0 without one.
+    shape : tuple of int
+        (R, p) of the local block.
+    columns : ndarray of int, (n, b)
+        Numbers of the unknowns of the border that each reading sees.
     """
 
     local: int | None
@@ -147,6 +160,9 @@ class Numbering:
     adjusted: list[Index]
     size: int
     band: int
+    rows: Index
+    shape: tuple[int, int]
+    columns: Index
 
     @classmethod
     def of(cls, problem: Problem) -> Numbering:
@@ -168,8 +184,81 @@ class Numbering:
             position += constant.sources
         for number in border:
             number[number < 0] = position
-        band = 0 if local is None else _band(problem.unknowns[local])
-        return cls(local, border, adjusted, position, band)
+        n = len(problem.readings)
+        seen = [border[k][block.index2].reshape(n, -1) for k, block in enumerate(problem.unknowns) if k != local] + [
+            np.broadcast_to(its, (n, its.size)) for its in adjusted
+        ]
+        columns = np.concatenate([np.zeros((n, 0), dtype=np.intp), *seen], axis=1)
+        if local is None:
+            return cls(local, border, adjusted, position, 0, np.zeros((n, 0), dtype=np.intp), (0, 1), columns)
+        block = problem.unknowns[local]
+        R, p = block.start.shape
+        return cls(local, border, adjusted, position, _band(block), block.index2, (R, p), columns)
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether each reading sees its own row of the local block, in their order."""
+        return self.rows.shape == (self.shape[0], 1) and bool((self.rows[:, 0] == np.arange(self.shape[0])).all())
+
+    @cached_property
+    def same_columns(self) -> bool:
+        """Whether all readings see the same unknowns of the border."""
+        return self.columns.size > 0 and bool((self.columns == self.columns[0]).all())
+
+    @cached_property
+    def of_local(self) -> Groups:
+        """Readings that see the same rows of the local block."""
+        return Groups.of(labels(self.rows))
+
+    @cached_property
+    def of_border(self) -> Groups:
+        """Readings that see the same unknowns of the border."""
+        return Groups.of(labels(self.columns))
+
+    @cached_property
+    def of_both(self) -> Groups:
+        """Readings that see the same rows and unknowns of the border."""
+        return Groups.of(labels(np.stack([self.of_local.label, labels(self.columns)], axis=1)))
+
+    def local_numbers(self, readings: Index) -> Index:
+        """Return the numbers of the local unknowns that readings see, (k, w p)."""
+        p = self.shape[1]
+        return np.asarray((self.rows[readings][:, :, None] * p + np.arange(p)).reshape(len(readings), -1))
+
+    @cached_property
+    def into_border(self) -> Layout:
+        """Where products (g, b, b) of derivatives by the border belong in D, (q + 1, q + 1)."""
+
+        def at(first: Index) -> Index:
+            columns = self.columns[first]
+            return np.asarray(columns[:, :, None] * (self.size + 1) + columns[:, None, :])
+
+        return Layout(self.of_border, at, self.columns.shape[1] ** 2)
+
+    @cached_property
+    def into_coupling(self) -> Layout:
+        """Where products (g, w p, b) belong in G, (R, p, q + 1)."""
+
+        def at(first: Index) -> Index:
+            return np.asarray(self.local_numbers(first)[:, :, None] * (self.size + 1) + self.columns[first][:, None, :])
+
+        return Layout(self.of_both, at, self.rows.shape[1] * self.shape[1] * self.columns.shape[1])
+
+    @cached_property
+    def into_band(self) -> Layout:
+        """Where products (g, w p, w p) belong in the band of T, (d, R, p, p), and one place for those that do not."""
+        (R, p), d = self.shape, self.band + 1
+
+        def at(first: Index) -> Index:
+            rows = self.rows[first]
+            # Where a row lies behind, it is the transpose; further ahead than the band, nothing is coupled.
+            ahead = rows[:, None, :] - rows[:, :, None]
+            inside = (ahead >= 0) & (ahead < d)
+            start = (ahead * R + rows[:, :, None])[:, :, None, :, None] * (p * p)
+            found = np.where(inside[:, :, None, :, None], start + np.arange(p * p).reshape(p, 1, p), d * R * p * p)
+            return found.reshape(len(rows), rows.shape[1] * p, -1)
+
+        return Layout(self.of_local, at, (self.rows.shape[1] * p) ** 2)
 
 
 def _band(block: Block) -> int:
@@ -200,8 +289,6 @@ class Linear:
         Derivatives by the rows of the eliminated block; w = 0 without one.
     border : ndarray, (n, m, b)
         Derivatives by the b unknowns of the border that a reading sees.
-    columns : ndarray of int, (n, b)
-        Their numbers.
     """
 
     problem: Problem
@@ -212,12 +299,30 @@ class Linear:
     whitener: Array
     local: Array
     border: Array
-    columns: Index
 
     @property
     def chi2(self) -> float:
         """Sum of the squared whitened residuals."""
         return float(np.vdot(self.residual, self.residual))
+
+    @cached_property
+    def rounding(self) -> float:
+        """Sum of squares of the errors in the whitened residuals by rounding of readings and unknowns."""
+        noise, number = self.problem.noise, self.numbering
+        y = np.abs(column(self.problem.y))
+        if noise.sd is None:
+            size = np.abs(self.whitener).sum(axis=2) * y.max(axis=1, initial=0.0, keepdims=True)
+        else:
+            # A number with the standard deviation s contributes at most y / s.
+            sd = column(np.asarray(noise.sd, dtype=float))
+            most = np.max(y / np.where(sd > 0, sd, np.inf), axis=1, initial=0.0, keepdims=True)
+            size = np.where(self.used, most, 0.0)
+        if number.local is not None:
+            table = np.abs(self.at.tables[number.local]).reshape(-1, 1)
+            groups = number.of_local
+            its = groups.each(np.abs(self.local_matrix)) @ table[number.local_numbers(groups.first)]
+            size = size + groups.spread(its, size.shape[1])[..., 0]
+        return float(np.sum(np.square(OPERATIONS * _EPS * size)))
 
     def normal(self) -> tuple[Normal, Array, Array]:
         """Return the factorised normal equations, and their right sides (R, p) and (q,) for the next step."""
@@ -235,67 +340,22 @@ class Linear:
         normal = factorised(band, G, D, self.gauge())
         return normal, -a, -(b + prior * offset)
 
-    @cached_property
-    def in_order(self) -> bool:
-        """Whether each reading sees its own row of the eliminated block, in their order."""
-        index = problem_block(self).index2
-        return index.shape == (len(problem_block(self).start), 1) and bool((index[:, 0] == np.arange(len(index))).all())
-
-    @cached_property
-    def same_columns(self) -> bool:
-        """Whether all readings see the same unknowns of the border."""
-        return self.columns.size > 0 and bool((self.columns == self.columns[0]).all())
-
     def sums(self) -> tuple[list[Array], Array, Array]:
         """Return the sums of products of derivatives: the band of T, G, and D."""
         number, q = self.numbering, self.numbering.size
-        b = self.columns.shape[1]
-        if self.same_columns:
-            flat = self.border.reshape(-1, b)
-            D = np.zeros((q + 1, q + 1))
-            pair: Any = np.ix_(self.columns[0], self.columns[0])
-            np.add.at(D, pair, flat.T @ flat)
-        else:
-            pairs = np.einsum("nmi,nmj->nij", self.border, self.border)
-            rows = np.broadcast_to(self.columns[:, :, None], pairs.shape)
-            cols = np.broadcast_to(self.columns[:, None, :], pairs.shape)
-            D = _summed(rows * (q + 1) + cols, pairs, (q + 1) ** 2).reshape(q + 1, q + 1)
-        D = D[:q, :q]
+        (R, p), d = number.shape, number.band + 1
+        A, B = self.local_matrix, self.border
+        D = number.into_border.summed(B, B, (q + 1) ** 2).reshape(q + 1, q + 1)[:q, :q]
         if number.local is None:
             return [np.zeros((0, 1, 1))], np.zeros((0, 1, q)), D
-        block = problem_block(self)
-        R, p = block.start.shape
-        index, A = block.index2, self.local
-        w = A.shape[2]
-        if self.in_order:
-            transposed = np.swapaxes(A[:, :, 0], 1, 2)
+        if number.in_order and (number.same_columns or not q):
+            transposed = np.swapaxes(A, 1, 2)
             G = np.zeros((q + 1, R, p))
-            if self.same_columns:
-                np.add.at(G, self.columns[0], np.moveaxis(transposed @ self.border, 2, 0))
-            elif b:
-                product = np.swapaxes(transposed @ self.border, 1, 2)
-                at: Any = (self.columns, np.arange(R)[:, None])
-                np.add.at(G, at, product)
-            return [transposed @ A[:, :, 0]], np.ascontiguousarray(np.moveaxis(G[:q], 0, 2)), D
-        band = [np.zeros((R, p, p)) for _ in range(number.band + 1)]
-        G = np.zeros((R, p, q + 1))
-        inner = np.arange(p * p).reshape(p, p)
-        for i in range(w):
-            for j in range(w):
-                ahead = index[:, j] - index[:, i]
-                chosen = (ahead >= 0) & (ahead <= number.band)
-                if not chosen.any():
-                    continue
-                product = np.einsum("nmk,nml->nkl", A[chosen, :, i], A[chosen, :, j])
-                for d in np.unique(ahead[chosen]):
-                    part = ahead[chosen] == d
-                    at = index[chosen, i][part]
-                    band[d] += _summed(at[:, None, None] * (p * p) + inner, product[part], R * p * p).reshape(R, p, p)
-            if b:
-                product = np.einsum("nmk,nmb->nkb", A[:, :, i], self.border)
-                flat = (index[:, i, None, None] * p + np.arange(p)[:, None]) * (q + 1) + self.columns[:, None, :]
-                G += _summed(flat, product, R * p * (q + 1)).reshape(R, p, q + 1)
-        return band, G[..., :q], D
+            np.add.at(G, number.columns[0], np.moveaxis(transposed @ B, 2, 0))
+            return [transposed @ A], np.ascontiguousarray(np.moveaxis(G[:q], 0, 2)), D
+        band = number.into_band.summed(A, A, d * R * p * p + 1)[:-1].reshape(d, R, p, p)
+        G = number.into_coupling.summed(A, B, R * p * (q + 1)).reshape(R, p, q + 1)[..., :q]
+        return list(band), G, D
 
     def gradient(self, residual: Array, rows: Index | None = None) -> tuple[Array, Array]:
         """Return ``J' r`` for whitened numbers (n, m) or (n, m, k): (R, p[, k]) and (q[, k]).
@@ -305,34 +365,43 @@ class Linear:
         only: Any = slice(None) if rows is None else rows
         single = residual.ndim == 2
         r = residual[..., None] if single else residual
-        k, q = r.shape[2], self.numbering.size
-        if self.same_columns:
-            b = np.zeros((q + 1, k))
-            np.add.at(b, self.columns[0], np.tensordot(self.border[only], r, axes=((0, 1), (0, 1))))
-        else:
-            product = np.einsum("nmb,nmk->nbk", self.border[only], r)
-            flat = self.columns[only][:, :, None] * k + np.arange(k)
-            b = _summed(flat, product, (q + 1) * k).reshape(q + 1, k)
-        b = b[:q]
-        if self.numbering.local is None:
+        number, k, q = self.numbering, r.shape[2], self.numbering.size
+        groups = number.of_border.among(rows)
+        product = products(groups.each(self.border[only]), groups.each(r))
+        b = rows_summed(number.columns[only][groups.first], product, q + 1)[:q]
+        if number.local is None:
             a = np.zeros((0, 1, k))
-        elif rows is None and self.in_order:
-            a = np.swapaxes(self.local[:, :, 0], 1, 2) @ r
+        elif number.in_order and rows is None:
+            a = np.swapaxes(self.local_matrix, 1, 2) @ r
         else:
-            block = problem_block(self)
-            R, p = block.start.shape
-            product = np.einsum("nmwp,nmk->nwpk", self.local[only], r)
-            flat = (block.index2[only][:, :, None, None] * p + np.arange(p)[:, None]) * k + np.arange(k)
-            a = _summed(flat, product, R * p * k).reshape(R, p, k)
+            R, p = number.shape
+            groups = number.of_local.among(rows)
+            product = products(groups.each(self.local_matrix[only]), groups.each(r))
+            first = groups.first if rows is None else rows[groups.first]
+            a = rows_summed(number.local_numbers(first), product, R * p).reshape(R, p, k)
         return (a[..., 0], b[..., 0]) if single else (a, b)
 
-    def effect(self, a: Array, b: Array) -> Array:
-        """Return ``J x`` for changes of the unknowns (R, p, k) and (q, k): the change of the residuals, (n, m, k)."""
+    def effect(self, a: Array, b: Array, rows: Index | None = None) -> Array:
+        """Return ``J x`` for changes of the unknowns (R, p, k) and (q, k): the change of the residuals, (n, m, k).
+
+        With ``rows``, of these readings only.
+        """
+        only: Any = slice(None) if rows is None else rows
+        number, m = self.numbering, self.used.shape[1]
         padded = np.concatenate([b, np.zeros((1, b.shape[1]))])
-        found = np.einsum("nmb,nbk->nmk", self.border, padded[self.columns])
-        if self.numbering.local is not None:
-            found += np.einsum("nmwp,nwpk->nmk", self.local, a[problem_block(self).index2])
+        groups = number.of_border.among(rows)
+        columns = number.columns[only][groups.first]
+        found = groups.spread(groups.each(self.border[only]) @ padded[columns], m)
+        if number.local is not None:
+            groups = number.of_local.among(rows)
+            its = a[number.rows[only][groups.first]].reshape(len(groups.first), self.local_matrix.shape[2], a.shape[2])
+            found = found + groups.spread(groups.each(self.local_matrix[only]) @ its, m)
         return np.asarray(found)
+
+    @property
+    def local_matrix(self) -> Array:
+        """Derivatives by the local unknowns that a reading sees, (n, m, w p)."""
+        return self.local.reshape(*self.used.shape, self.local.shape[2] * self.local.shape[3])
 
     def moved(self, a: Array, b: Array) -> Unknown:
         """Return the values of the unknowns after a step (R, p), (q,)."""
@@ -390,7 +459,7 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
     values = [*at.tables, *problem.constant_tables(at)]
     count, tables = len(problem.unknowns), problem.tables
     rows = [table.rows(value) for table, value in zip(tables, values, strict=True)]
-    raw = problem.residuals(at)
+    raw = problem.known(rows)
     used = np.isfinite(raw)
     n, m = raw.shape
     given: Mapping[str, Array] = {}
@@ -398,33 +467,56 @@ def linearised(problem: Problem, at: Unknown, numbering: Numbering | None = None
         given = problem.derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
     J = _derivatives(problem, tables, values, given)
     whitener = _whitener(problem, rows, used, given.get(READINGS))
-    r = (whitener @ np.where(used, raw, 0.0)[..., None])[..., 0]
-    parts, numbers = [], []
+    r = white_of(whitener, np.where(used, raw, 0.0))
+    parts = []
     local = np.zeros((n, m, 0, 1))
     for k, block in enumerate(problem.unknowns):
-        white = np.einsum("nij,njwk->niwk", whitener, J[k])
+        white = white_of(whitener, J[k])
         if k == number.local:
-            seen = block.freed[block.index2]  # (n, w, p)
-            local = white * seen[:, None]
+            local = white * _weight(block)
             continue
-        parts.append(white.reshape(n, m, -1))
-        numbers.append(number.border[k][block.index2].reshape(n, -1))
-    for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
+        parts.append((white if block.weight is None else white * block.weight[:, None, :, None]).reshape(n, m, -1))
+    for k, constant in problem.adjusted.items():
         factor = constant.factor[constant.index2]  # (n, w, width, k)
-        white = np.einsum("nij,njwc,nwcz->niz", whitener, J[count + list(problem.adjusted).index(k)], factor)
-        parts.append(white)
-        numbers.append(np.broadcast_to(its, (n, its.size)))
+        each = J[count + list(problem.adjusted).index(k)]
+        its = (each if constant.weight is None else each * constant.weight[:, None, :, None]).reshape(n, m, -1)
+        parts.append(white_of(whitener, its @ factor.reshape(n, its.shape[2], -1)))
     border = np.concatenate(parts, axis=2) if parts else np.zeros((n, m, 0))
-    columns = np.concatenate(numbers, axis=1) if numbers else np.zeros((n, 0), dtype=np.intp)
-    return Linear(problem, at, number, r, used, whitener, local, border, columns)
+    return Linear(problem, at, number, r, used, whitener, local, border)
+
+
+def _weight(block: Block) -> Array:
+    """Return the factors of the derivatives by the rows that a reading sees: weights, and 0 for what is not estimated.
+
+    (n, 1, w, p), or (n, 1, w, 1) if they are the same for all columns.
+    """
+    free = block.freed if (block.freed != block.freed[:, :1]).any() else block.freed[:, :1]
+    found = free[block.index2]
+    return np.asarray(found if block.weight is None else found * block.weight[..., None], dtype=float)[:, None]
+
+
+def white_of(whitener: Array, values: Array) -> Array:
+    """Return numbers of readings (n, m, ...) in units of their noise, by their whitener (n, m, m)."""
+    if whitener.shape[1] == 1:
+        return np.asarray(whitener.reshape(-1, *[1] * (values.ndim - 1)) * values)
+    flat = values.reshape(*values.shape[:2], -1)
+    return np.asarray((whitener @ flat).reshape(values.shape))
 
 
 def _derivatives(problem: Problem, tables: list[Table], values: list[Array], given: Mapping[str, Array]) -> list[Array]:
-    """Return the derivatives (n, m, w, width) by all unknowns, then by the adjusted constants."""
+    """Return the derivatives by all unknowns, then by the adjusted constants, as the equation sees their rows.
+
+    (n, m, w, width); w = 1 for a sum of rows.
+    """
     count = len(problem.unknowns)
-    known = {k: by_slot(given[name], tables[k]) for k, name in enumerate(problem.unknowns._fields) if name in given}
+    known: dict[int, Array] = {}
+    for k, name in enumerate(problem.unknowns._fields):
+        if name not in given:
+            continue
+        J = given[name]
+        known[k] = J[:, :, None, :] if J.ndim == 3 else J
     wanted = [k for k in range(count) if k not in known] + [count + k for k in problem.adjusted]
-    found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted)
+    found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted, weighed=False)
     by_number = {**known, **dict(zip(wanted, found, strict=True))}
     return [by_number[k] for k in [*range(count), *(count + k for k in problem.adjusted)]]
 
@@ -447,19 +539,15 @@ def _whitener(problem: Problem, rows: list[Array], used: NDArray[np.bool_], by_r
     L = by_readings
     if L is None:
         L = along(lambda moved: problem.evaluate(moved.reshape(shape), rows), y, scale)
-    V = problem.noise.covariance((len(y), y.shape[1]))
-    V = L @ V @ np.swapaxes(L, 1, 2)
+    root = problem.noise.effect(L)
     m = used.shape[1]
     if m == 1:
+        V = np.sum(np.square(root), axis=2, keepdims=True)
         return np.asarray(np.where(used[..., None], 1.0 / np.sqrt(np.where(used[..., None], V, 1.0)), 0.0))
+    V = root @ np.swapaxes(root, 1, 2)
     both = used[:, :, None] & used[:, None, :]
     root = np.linalg.cholesky(np.where(both, V, np.eye(m)))
     return np.asarray(np.where(used[:, None, :], np.linalg.inv(root), 0.0) * used[:, :, None])
-
-
-def _summed(index: Index, values: Array, size: int) -> Array:
-    """Return the sums of values by index, (size,)."""
-    return np.asarray(np.bincount(index.ravel(), weights=values.ravel(), minlength=size), dtype=float)
 
 
 def _like(named: Any, values: list[Array]) -> Any:

@@ -244,6 +244,37 @@ def test_a_chain_has_the_dense_solution(knots: int) -> None:
     pair = parts.normal.local_covariance(np.array([3]), np.array([5]))[0]
     pair = pair + parts.normal.shared[3] @ parts.normal.shared[5].T
     assert pair == pytest.approx(C[4:6, 8:10], rel=1e-6, abs=1e-12)
+    rng = np.random.default_rng(knots)
+    a, b = rng.standard_normal((knots, 2, 4)), rng.standard_normal((5, 4))
+    a[0] = 0.0  # not estimated
+    whole_a = np.concatenate([a[1:].reshape(-1, 4), b])
+    assert parts.normal.square(a, b) == pytest.approx(whole_a.T @ C @ whole_a, rel=1e-7)
+
+
+def test_knots_that_no_reading_sees_are_named() -> None:
+    problem = drifting(9)
+    seen = problem.unknowns.knot.index[:, 1]
+    with pytest.raises(FitError, match=r"the readings do not determine knot [5-8]"):
+        fit(problem.without(seen >= 4))
+
+
+@pytest.mark.parametrize("rate", [0.3, 0.01])
+def test_a_refreshed_quantity_converges_to_a_millionth_of_the_uncertainty(rate: float) -> None:
+    """The frozen quantity follows the unknown by a part of it: the steps decrease by this part, as a series does."""
+    x = np.linspace(0, 1, 7)
+    base = straight(x, 2 + 3 * x)
+    frozen = [0.0]
+
+    def equation(y: Array, u: Line[Array], c: Any) -> Array:
+        return np.asarray(base.equation(y, u, c) + rate * frozen[0])
+
+    def refresh(problem: Problem, u: Line[Array]) -> Problem:
+        frozen[0] = float(u.line[0, 0])
+        return problem
+
+    found = fit(replace(base, equation=equation), refresh=refresh)
+    u = np.sqrt(found.normal.covariance[0, 0])
+    assert found.unknowns.line[0, 0] == pytest.approx(2 / (1 - rate), abs=1e-6 * u)
 
 
 def test_a_vector_reading_with_correlated_noise_has_the_generalised_solution() -> None:

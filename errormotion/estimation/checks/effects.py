@@ -114,10 +114,9 @@ def reduced(fit: Fit, white: Array, rows: Index | None = None) -> tuple[Array, A
     linear = fit.linear
     r = linear.residual if rows is None else linear.residual[rows]
     a, b = linear.gradient(white, rows)
-    x, z = fit.normal.solve(a, b)
     flat = white.reshape(-1, white.shape[2])
     # D' D - D' J C J' D
-    N = flat.T @ flat - np.tensordot(a, x, axes=((0, 1), (0, 1))) - b.T @ z
+    N = flat.T @ flat - fit.normal.square(a, b)
     return flat.T @ r.ravel(), (N + N.T) / 2
 
 

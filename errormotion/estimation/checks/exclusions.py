@@ -283,8 +283,9 @@ class _Search:
         listed = []
         for each in () if self.suspects is None else self.suspects(found):
             J = each.design[:, None, :] if each.design.ndim == 2 else each.design
-            white = found.linear.whitener @ J
-            size, gain, rank = solved(*reduced(found, white), 1e-6 * float(np.vdot(white, white)))
+            rows = np.flatnonzero(J.any(axis=(1, 2)))
+            white = found.linear.whitener[rows] @ J[rows]
+            size, gain, rank = solved(*reduced(found, white, rows), 1e-6 * float(np.vdot(white, white)))
             if rank and np.linalg.norm(size) >= each.smallest and each.words not in self.barred:
                 listed.append(_Structure(each, size, float(gain), int(rank)))
         return listed

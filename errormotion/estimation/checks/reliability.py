@@ -162,8 +162,8 @@ def _masked(fit: Fit, numbers: Numbers) -> tuple[tuple[tuple[At, At, float], ...
         D[np.searchsorted(some, rows[part]), :, np.arange(len(its))] = W[part]
         x, z = fit.normal.solve(*fit.linear.gradient(D, some))
         # D_i' (1 - H) D_j
-        predicted = fit.linear.effect(x, z)[rows]
-        N[:, part] = -np.einsum("km,kmj->kj", W, predicted)
+        predicted = np.swapaxes(fit.linear.whitener, 1, 2) @ fit.linear.effect(x, z)
+        N[:, part] = -predicted[rows, at[:, 1]]
     same = rows[:, None] == rows
     N += np.where(same, W @ W.T, 0.0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))

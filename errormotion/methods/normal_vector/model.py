@@ -216,11 +216,14 @@ class Probing:
     def seen(self, problem: Problem) -> Observations:
         """Return the readings of a problem as observations."""
         k, b, m = self.shape
-        whole = np.isfinite(problem.readings).all(axis=1)
-        touched = self.data.seen.touched
-        valid = np.broadcast_to(whole.reshape(k, b, m if touched else 1), (k, b, m))
         y = problem.y.reshape(k, b, -1, 3)
-        return replace(self.data.seen.without(~valid), position=np.broadcast_to(y, (k, b, m, 3)))
+        return replace(self.data.seen.without(~self._valid(problem)), position=np.broadcast_to(y, (k, b, m, 3)))
+
+    def _valid(self, problem: Problem) -> NDArray[np.bool_]:
+        """Return which numbers of a problem are known, (k, b, m)."""
+        k, b, _ = self.shape
+        whole = ~np.isnan(problem.readings).any(axis=1)
+        return np.broadcast_to(whole.reshape(k, b, -1), self.shape)
 
     def determined(self, problem: Problem) -> Problem:
         """Return a problem without the cycles that do not determine the motion, with the knots of the others.
@@ -280,7 +283,7 @@ class Probing:
         twist = problem.unknowns.twist.rows(x.twist)
         true = self._true(problem.y, Unknowns(twist, x.reach)).reshape(*self.shape, 3)
         centre = problem.constants.centre
-        value = improved(centre.value, true, self.seen(problem).valid)
+        value = improved(centre.value, true, self._valid(problem))
         return replace(problem, constants=Known(replace(centre, value=value)))
 
     # ------------------------------------------------------------------ what may be wrong
@@ -394,7 +397,8 @@ def determines_motion(seen: Observations, motion: Motion, anchor: Array) -> NDAr
         normal = np.broadcast_to(np.eye(3), (*seen.position.shape[:2], 3, 3))
     H = motion.design(motion.lever(seen.position), normal)
     H = H / np.where(np.array(motion.seen) < 3, 1.0, spread_of(seen))
-    N = np.einsum("kbmp,kbm,kbmq->kpq", H, seen.valid.astype(float), H)
+    H = np.where(seen.valid[..., None], H, 0.0).reshape(len(H), -1, H.shape[-1])
+    N = np.swapaxes(H, 1, 2) @ H
     eigenvalues = np.linalg.eigvalsh(N)
     return np.asarray((eigenvalues[:, 0] > FLAT**2 * eigenvalues[:, -1]) & (eigenvalues[:, -1] > 0))
 

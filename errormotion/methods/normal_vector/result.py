@@ -63,9 +63,9 @@ class Excluded:
         k, b, m = probing.shape
         wrong = np.zeros((k, b, m), dtype=bool)
         moves = []
-        names = {probing.moved(ball, cycle): (ball, cycle) for ball in range(b) for cycle in range(k)}
-        search = solved.cleaned
-        for each in () if search is None else search.made:
+        made = () if solved.cleaned is None else solved.cleaned.made
+        names = {probing.moved(ball, cycle): (ball, cycle) for ball in range(b) for cycle in range(k)} if made else {}
+        for each in made:
             if each.words in names:
                 moves.append((each, *names[each.words]))
             else:

@@ -12,7 +12,7 @@ from errormotion.errors import FitError
 from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
 from errormotion.estimation.checks.candidates import Candidate, steps
-from errormotion.estimation.checks.effects import Numbers, information
+from errormotion.estimation.checks.effects import Numbers, information, solved
 from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, doubts, notes
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
@@ -228,6 +228,29 @@ def test_a_ball_that_moved_is_found_with_its_cycle(exclude: bool) -> None:
         assert found.excluded.sum() == 60 - 37 + 1
     else:
         assert found.fit.unknowns.added_1[0, 0] == pytest.approx(6, abs=1.5)
+
+
+def test_the_instant_of_a_step_is_the_best_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the gain has several maxima: a ball that moved, and was put back for the most part."""
+    rng = np.random.default_rng(21)
+    c, b = (each.ravel() for each in np.meshgrid(np.arange(200), np.arange(3), indexing="ij"))
+    search = steps(c.astype(float), b, np.ones((c.size, 1)), lambda i, t: f"{i} {t:g}")
+    for _ in range(20):
+        y = rng.standard_normal((200, 3)) + np.cumsum(rng.standard_normal(200))[:, None]
+        first, last = np.sort(rng.choice(np.arange(1, 200), 2, replace=False))
+        y[first:, 1] += 4.0
+        y[last:, 1] -= 3.0 * rng.uniform(0.8, 1.2)
+        found = fit(levels(200, 3, y))
+        fast = search(found)
+        with monkeypatch.context() as every:
+            every.setattr("errormotion.estimation.checks.candidates.CUTS", 1000)
+            best = search(found)
+        for one, other in zip(fast, best, strict=True):
+            gains = [
+                float(solved(*information(found, each.design[:, None, :] if each.design.ndim == 2 else each.design))[1])
+                for each in (one, other)
+            ]
+            assert gains[0] > 0.99 * gains[1]
 
 
 def test_a_single_outlier_is_not_a_move() -> None:

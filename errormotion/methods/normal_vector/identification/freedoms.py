@@ -55,6 +55,8 @@ class Motion:
 
     def full(self, values: Array) -> Array:
         """Return twists (..., 6) from the errors that are determined, (..., p); 0 for the others."""
+        if values.shape[-1] == 6:
+            return values
         found = np.zeros((*values.shape[:-1], 6))
         found[..., list(self.seen)] = values
         return found
@@ -70,17 +72,26 @@ class Motion:
     def design(self, lever: Array, normal: Array) -> Array:
         """Return the derivative of the error along unit vectors (..., 3), at rotated levers (..., 3), (..., p)."""
         full = np.concatenate([normal, np.cross(lever, normal)], axis=-1)
-        return np.asarray(full[..., list(self.seen)])
+        return full if len(self.seen) == 6 else np.asarray(full[..., list(self.seen)])
 
 
 def rotated(rotation: Array, vector: Array) -> Array:
     """Return vectors (..., 3) rotated by rotation vectors (..., 3), by Rodrigues' formula."""
-    square = np.sum(rotation**2, axis=-1, keepdims=True)
-    angle = np.sqrt(square)
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    across = np.cross(rotation, vector)
-    return np.asarray(vector + first * across + second * np.cross(rotation, across))
+    (a, b, c), (x, y, z) = np.moveaxis(rotation, -1, 0), np.moveaxis(vector, -1, 0)
+    square = a * a + b * b + c * c
+    half = np.sqrt(square) / 2
+    sinc = np.sinc(half / np.pi)
+    # v (1 - g r^2) + f r x v + g r (r v) with f = sin(|r|) / |r| and g = (1 - cos(|r|)) / |r|^2
+    f, g = sinc * np.cos(half), 0.5 * sinc**2
+    along, rest = g * (a * x + b * y + c * z), 1 - g * square
+    return np.stack(
+        [
+            rest * x + f * (b * z - c * y) + along * a,
+            rest * y + f * (c * x - a * z) + along * b,
+            rest * z + f * (a * y - b * x) + along * c,
+        ],
+        axis=-1,
+    )
 
 
 def spread(centres: Array) -> float:

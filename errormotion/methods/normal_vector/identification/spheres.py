@@ -128,31 +128,37 @@ def centres(seen: Observations, anchor: Array, reach: Array) -> Centres:
     cycle: the centre is the intersection of spheres around the tip, by Gauss-Newton from ``anchor`` (b, 3), m.
     """
     valid = seen.valid & np.isfinite(reach)
-    weight = seen.weight * valid[..., None] * valid[..., None, :]
     if not seen.touched:
         known = np.all(valid, axis=-1)
         centre = np.where(known[..., None], seen.position[:, :, 0], np.nan)
-        return Centres(centre, _inverse(weight))
+        return Centres(centre, _inverse(seen.weight * valid[..., None] * valid[..., None, :]))
     centre = np.broadcast_to(anchor, (len(seen.position), *anchor.shape)).copy()
-    cofactor = np.full((*centre.shape, 3), np.nan)
+    N, sound = np.zeros((*centre.shape, 3)), None
+    weight = np.diagonal(seen.weight, axis1=2, axis2=3) * valid  # touches are independent
     for _ in range(MAX_ITERATIONS):
         away = seen.position - centre[:, :, None]
         length = np.linalg.norm(away, axis=-1)
         normal = away / np.where(length > 0, length, 1.0)[..., None]
+        WN = weight[..., None] * normal
+        N = np.swapaxes(WN, 2, 3) @ normal
         misfit = np.where(valid, length - reach, 0.0)
-        WN = weight @ normal
-        cofactor = _inverse(np.swapaxes(normal, 2, 3) @ WN)
-        step = (cofactor @ (np.swapaxes(WN, 2, 3) @ misfit[..., None]))[..., 0]
-        step = np.nan_to_num(step)
+        sound = _sound(N) if sound is None else sound  # the normals hardly change
+        right = np.where(sound[..., None, None], np.swapaxes(WN, 2, 3) @ misfit[..., None], 0.0)
+        step = np.linalg.solve(np.where(sound[..., None, None], N, np.eye(3)), right)[..., 0]
         centre += step
         if np.abs(step).max(initial=0.0) < 1e-13:
             break
+    cofactor = _inverse(N)
     return Centres(np.where(np.isfinite(cofactor[..., 0]), centre, np.nan), cofactor)
+
+
+def _sound(N: Array) -> NDArray[np.bool_]:
+    """Return which of symmetric matrices (..., p, p) are not singular, (...)."""
+    size = np.linalg.eigvalsh(N)
+    return np.asarray(size[..., 0] > SINGULAR * size[..., -1])
 
 
 def _inverse(N: Array) -> Array:
     """Return the inverses of symmetric matrices (..., p, p); NaN for singular ones."""
-    size = np.linalg.eigvalsh(N)
-    sound = size[..., 0] > SINGULAR * size[..., -1]
-    safe = np.where(sound[..., None, None], N, np.eye(N.shape[-1]))
-    return np.asarray(np.where(sound[..., None, None], np.linalg.inv(safe), np.nan))
+    known = _sound(N)[..., None, None]
+    return np.asarray(np.where(known, np.linalg.inv(np.where(known, N, np.eye(N.shape[-1]))), np.nan))
