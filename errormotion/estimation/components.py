@@ -48,6 +48,9 @@ CONVERGED = 1e-12
 """Increase of the likelihood that the next step promises, at which the scoring ends."""
 CHANGED = 1e-6
 """Relative change of the variances from one linearisation to the next, at which these end."""
+STALLED = 1e-3
+"""The same for changes that do not decrease any more, and the square root of the increase at which the scoring ends if
+it does not: rounding, where variances differ by many orders of magnitude."""
 MAX_STEPS = 200
 MAX_FITS = 20
 
@@ -149,13 +152,18 @@ def components(
     linear = linearised(problem, problem.start)
     theta: Array | None = None
     found: Fit | None = None
+    change = np.inf
     for _ in range(MAX_FITS):
         contrasts = _Contrasts.of(linear, names, estimated, what)
         last, (theta, information, likelihood) = theta, contrasts.maximised(theta)
         floor = contrasts.floor()
         used = np.maximum(theta, floor)
-        if last is not None and (np.abs(used - np.maximum(last, floor)) <= CHANGED * used).all():
-            break
+        if last is not None:
+            # Of a variance, or of its standard uncertainty where this is larger: the likelihood shows no less.
+            size = np.maximum(used, 1.0 / np.sqrt(np.maximum(np.diagonal(information), 1e-300)))
+            before, change = change, float((np.abs(used - np.maximum(last, floor)) / size).max(initial=0.0))
+            if change <= CHANGED or (change <= STALLED and change > before / 2):
+                break
         start = linear.at if found is not None else None
         found = fit(_weighted(problem, contrasts.names, used), refresh=refresh, what=what, start=start)
         linear = _unweighted(found.linear, problem, contrasts.names, used)
@@ -273,13 +281,15 @@ class _Contrasts:
         if noise >= 0:
             least[noise] = LEAST_NOISE
         value, score, information = self._likelihood(t * unit)
+        gain = np.inf
         for _ in range(MAX_STEPS):
             g, F = score * unit, information * unit * unit[:, None]
             free = (t > least) | (g > 0)
             step = np.zeros_like(t)
             if free.any():
                 step[free] = np.linalg.lstsq(F[np.ix_(free, free)], g[free], rcond=1e-12)[0]
-            if float(g @ step) <= CONVERGED:
+            before, gain = gain, float(g @ step)
+            if gain <= CONVERGED or (gain <= STALLED**2 and gain > before / 2):
                 break
             for _ in range(40):
                 tried = np.maximum(t + step, least)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -266,3 +267,13 @@ def test_readings_without_any_noise_have_the_variances_of_their_effects(seed: in
     of_run = problem.readings.reshape(2, 4, 7).mean(axis=(0, 2))  # half the sum of both approaches
     assert found.variance[0] == pytest.approx(np.var(of_run, ddof=1), rel=1e-3)
     assert found.variance[found.names.index(NOISE)] < 1e-7
+
+
+def test_a_variance_that_the_readings_hardly_determine_does_not_prevent_convergence() -> None:
+    """Changes far below the standard uncertainty of a variance end the iteration, however small the variance is."""
+    rng, sd = np.random.default_rng(190), np.where(np.arange(11) < 5, 0.3e-6, 2e-6)
+    problem, _, _ = positioning(5, 11, 90, sizes=np.array([0.3e-6, 0.0, 0.0, 0.0]), sd=0.0)
+    y = problem.readings + rng.standard_normal(110) * np.tile(sd, 10)
+    of_target = np.broadcast_to(y.reshape(2, 5, 11).std(axis=1, keepdims=True), (2, 5, 11)).ravel()
+    found = components(replace(problem, readings=y, noise=Noise(sd=of_target, stated=False)))
+    assert (found.variance >= 0).all()

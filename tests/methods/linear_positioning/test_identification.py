@@ -259,3 +259,28 @@ def test_missing_readings_of_a_drifting_axis_do_not_displace_a_target(raw_of, id
     assert u[4] == pytest.approx(u[5], rel=0.01)
     between = errors.em.covariance_between(4, 5).values[0, 0] / (u[4] * u[5])
     assert between > 0.99
+
+
+@pytest.mark.parametrize("seed", [*range(20), 354, 671, 1340])
+def test_variances_of_very_different_sizes_are_found(seed):
+    """Nanometres beside tens of micrometres, unequal targets, rounded and missing readings: no refusal of enough data."""
+    draw = np.random.default_rng(seed)
+    m, runs = int(draw.integers(3, 15)), int(draw.integers(2, 12))
+    z = np.sort(draw.uniform(-1, 1, m))
+    sd = 10 ** draw.uniform(-9, -5) * np.exp(draw.normal(size=m) * draw.choice([0, 0, 1.0, 2.0]))
+    effects = draw.normal(size=(4, runs)) * (10 ** draw.uniform(-9, -5, size=4) * draw.integers(0, 2, size=4))[:, None]
+    common, opposite = (effects[k][:, None] + effects[k + 1][:, None] * z for k in (0, 2))
+    x = np.stack([common + opposite, common - opposite]) + sd * draw.normal(size=(2, runs, m))
+    x += 1e-5 * draw.normal(size=m)
+    if draw.random() < 0.3:
+        x = np.round(x / 1e-7) * 1e-7
+    if draw.random() < 0.5:
+        x[draw.random(x.shape) < draw.choice([0.05, 0.2, 0.5, 0.8])] = np.nan
+    try:
+        found = scatter.scatter(x, z, kind="auto", drift=1e-7 if runs < 4 else None, stated=None)
+    except MethodError as error:
+        assert "expected 3 degrees of freedom or more" in str(error)  # noqa: PT017
+        return
+    assert np.isfinite(found.run_stated).all()
+    assert (found.run_stated >= found.run * (1 - 1e-9)).all()
+    assert (found.own_stated[np.isfinite(x).any(axis=1)] >= 0.0).all()

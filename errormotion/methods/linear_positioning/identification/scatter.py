@@ -45,6 +45,8 @@ MIN_FREEDOM = 3
 """Smallest number of degrees of freedom for the scatter of all readings."""
 SIGNIFICANT = 1e-3
 """Probability in Bartlett's test of equal variances below which each target has its own variance."""
+SMALLEST = 1e-6
+"""Variance of a target, of the common one, below which its readings agree by accident, or by rounding."""
 EQUAL = 1e-15
 """Standard deviation below which readings are exactly equal, m or rad."""
 
@@ -260,6 +262,7 @@ def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, f
     if kind == "pooled" or (kind == "auto" and not _differ(square, redundancy)):
         return np.full(square.shape, pooled), freedom, True, False
     each = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), pooled)
+    each = np.maximum(each, SMALLEST * pooled)
     of_each = float(np.median(redundancy[redundancy > 0.5]))
     if of_each > 2:
         return each, of_each, False, False
