@@ -263,7 +263,7 @@ def test_missing_readings_of_a_drifting_axis_do_not_displace_a_target(raw_of, id
 
 @pytest.mark.parametrize("seed", [*range(20), 354, 671, 1340])
 def test_variances_of_very_different_sizes_are_found(seed):
-    """Nanometres beside tens of micrometres, unequal targets, rounded and missing readings: enough data have a result."""
+    """Nanometres beside tens of micrometres, unequal targets, rounded and missing readings: all have a result."""
     draw = np.random.default_rng(seed)
     m, runs = int(draw.integers(3, 15)), int(draw.integers(2, 12))
     z = np.sort(draw.uniform(-1, 1, m))
