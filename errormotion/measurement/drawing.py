@@ -24,7 +24,7 @@ from errormotion.measurement.identification import Solved, dataset, solve
 from errormotion.measurement.observed import Model, Observed, as_expected
 from errormotion.plugins import MethodInfo, Redraw, Redrawing
 
-__all__ = ["READINGS", "redrawing", "simulate"]
+__all__ = ["READINGS", "independent_draws", "moved", "redrawing", "simulate", "standard_draw"]
 
 READINGS = "readings"
 """The name of the noise among the sources."""
@@ -49,14 +49,14 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
     groups = {source.group for source in solved.relative.errors.sources}
     of_readings = {observed.shared, *((observed.datum.group,) if observed.datum is not None else ())}
     sources[READINGS] = Redraw(noisy, groups=tuple(sorted(of_readings & groups)), own=True)
-    for name, number in _drawn(problem).items():
-        sources[name] = Redraw(_standard(name, number), groups=(name,) if name in groups else ())
+    for name, number in independent_draws(problem).items():
+        sources[name] = Redraw(standard_draw(name, number), groups=(name,) if name in groups else ())
 
     def trial(data: xr.Dataset, its: Any) -> xr.Dataset:
-        drawn = {name: np.asarray(data[name].values) for name in _drawn(problem) if name in data}
-        moved = _moved(problem, data[READINGS].values.reshape(problem.readings.shape), drawn)
+        drawn = {name: np.asarray(data[name].values) for name in independent_draws(problem) if name in data}
+        changed = moved(problem, data[READINGS].values.reshape(problem.readings.shape), drawn)
         origin = provenance.make(its, None, None, steps=["trial"])
-        return dataset(model, solve(replace(observed, problem=moved, reliability=False)), raw, info, origin)
+        return dataset(model, solve(replace(observed, problem=changed, reliability=False)), raw, info, origin)
 
     return Redrawing(start, settings, sources, identify=trial)
 
@@ -78,8 +78,8 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
         raise ValueError("simulate: expected a model that states 'recorded', the variable of its readings")
     problem = observed.problem
     exact = solve(as_expected(observed))
-    drawn = {name: generator.standard_normal(number) for name, number in _drawn(problem).items()}
-    true = _moved(problem, problem.readings, drawn, priors=False)
+    drawn = {name: generator.standard_normal(number) for name, number in independent_draws(problem).items()}
+    true = moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)
     root = np.linalg.cholesky(problem.noise.covariance(column(y).shape))
     noisy = column(y) + (root @ generator.standard_normal((*column(y).shape, 1)))[..., 0]
@@ -97,7 +97,7 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     return measured.assign_attrs(machine="simulated", instruments=made), zero.assign_attrs(machine="simulated")
 
 
-def _drawn(problem: Problem) -> dict[str, int]:
+def independent_draws(problem: Problem) -> dict[str, int]:
     """Return the number of independent draws of each source by its group: constants, and priors of unknowns."""
     found: dict[str, int] = {}
     for name, block in zip(problem.unknowns._fields, problem.unknowns, strict=True):
@@ -110,7 +110,7 @@ def _drawn(problem: Problem) -> dict[str, int]:
     return found
 
 
-def _standard(name: str, number: int) -> Callable[..., tuple[xr.Dataset, Any]]:
+def standard_draw(name: str, number: int) -> Callable[..., tuple[xr.Dataset, Any]]:
     """Return the draw of standard normal numbers of one source."""
 
     def draw(data: xr.Dataset, its: Any, generator: np.random.Generator) -> tuple[xr.Dataset, Any]:
@@ -119,7 +119,7 @@ def _standard(name: str, number: int) -> Callable[..., tuple[xr.Dataset, Any]]:
     return draw
 
 
-def _moved(problem: Problem, readings: Array, drawn: dict[str, Array], *, priors: bool = True) -> Problem:
+def moved(problem: Problem, readings: Array, drawn: dict[str, Array], *, priors: bool = True) -> Problem:
     """Return the problem with other readings, and with constants and centres of priors moved by draws."""
     left = {name: list(np.asarray(values, dtype=float)) for name, values in drawn.items()}
     unknowns, constants = [], []
@@ -157,12 +157,12 @@ def _consistent(true: Problem, exact: Solved, drawn: dict[str, Array]) -> Array:
     tables, left = [], {name: list(values) for name, values in drawn.items()}
     for name, block, table in zip(true.unknowns._fields, true.unknowns, at.tables, strict=True):
         which = block.freed & (block.information > 0)
-        moved = table.copy()
+        its = table.copy()
         for row, col in np.argwhere(which):
-            moved[row, col] = block.start[row, col] + left[block.group or name].pop(0) / np.sqrt(
+            its[row, col] = block.start[row, col] + left[block.group or name].pop(0) / np.sqrt(
                 block.information[row, col]
             )
-        tables.append(moved)
+        tables.append(its)
     rows = [
         table.rows(value)
         for table, value in zip(true.tables, [*tables, *(constant.value for constant in true.constants)], strict=True)
@@ -172,7 +172,7 @@ def _consistent(true: Problem, exact: Solved, drawn: dict[str, Array]) -> Array:
     scale = np.broadcast_to(np.asarray(true.reading_scale, dtype=float), (y.shape[1],))
     for _ in range(4):
         r = column(true.evaluate(y.reshape(shape), rows))
-        L = along(lambda moved: true.evaluate(moved.reshape(shape), rows), y, scale)
+        L = along(lambda at: true.evaluate(at.reshape(shape), rows), y, scale)
         y = y - (np.linalg.pinv(L) @ r[..., None])[..., 0]
     return y.reshape(shape)
 

@@ -1,7 +1,7 @@
-"""Sources of tracker readings for the Monte Carlo method.
+"""Sources of tracker readings for the Monte Carlo method: draws of the equation that the identification solves.
 
-A drawn reading contains the noise twice, that of the measurement and that of the draw. The identification therefore
-tests drifts and similar effects with the noise times the square root of two.
+A trial is a fit of readings drawn about those measured, with drift and known values drawn about theirs. Corrections,
+outliers and the size of the noise are those of the identification.
 """
 
 from __future__ import annotations
@@ -9,97 +9,59 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import xarray as xr
 
-from errormotion.methods.multilateration.identification.expansion import air_scale, scale_strain
-from errormotion.methods.multilateration.identification.uncertainty import READINGS, REPEATABILITY, UNEXPLAINED
+from errormotion.measurement.drawing import READINGS, independent_draws, moved, standard_draw
+from errormotion.methods.multilateration.identification.identify import estimated
+from errormotion.methods.multilateration.identification.uncertainty import REPEATABILITY, UNEXPLAINED
+from errormotion.methods.multilateration.network.model import DRIFT, STATIONS
+from errormotion.methods.multilateration.network.solver import fitted_again
 from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
-    import xarray as xr
-
     from errormotion.arrays import Array
-    from errormotion.methods.multilateration.settings import Expansion, Settings
+    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.plugins.redrawing import Act, Draw
 
-DRAWN_NOISE = float(np.sqrt(2.0))
-"""Noise of a drawn reading over that of a measured one."""
+XYZ = ("EX", "EY", "EZ")
 
 
 def redrawing(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings without outliers, and their sources: noise and repeatability, scales, expansion."""
-    d = _displacement(raw)
-    known = (errors["left_out"].transpose("station", "target").values == 0) & np.isfinite(errors["EX"].values)
-    measured = raw["displacement"].attrs
-    reduced = raw.load().assign(displacement=(("station", "target"), np.where(known, d, np.nan), measured))
-    reduced["displacement_noise"] = (raw["displacement_noise"] * DRAWN_NOISE).assign_attrs(
-        raw["displacement_noise"].attrs
-    )
-    quiet = {"robust": False, "noise": "stated", "parametric": False}
-    if settings.repeatability is not None:
-        quiet |= {
-            "repeatability": settings.repeatability * DRAWN_NOISE,
-            "repeatability_uncertainty": settings.repeatability_uncertainty * DRAWN_NOISE,
-        }
-    sources = {"readings": _readings(float(errors["noise"]))}
-    if settings.together and "repeatability" in errors:
-        sources["repeatability"] = _positions(float(errors["repeatability"]), errors)
-    refraction = float(np.linalg.norm(list(air_scale(raw, settings.air, [])[1].values())))  # all have the same effect
-    for group, relative in (("refraction", refraction), ("scale of the tracker", settings.scale_or_assumed)):
-        if relative > 0:
-            sources[group] = _scale(relative, group)
-    if settings.expansion is not None:
-        warmer, _ = scale_strain(raw, settings.expansion)
-        reduced["scale_temperature"] = (("station", "direction"), warmer + settings.expansion.reference)
-        reduced["scale_temperature"].attrs["units"] = "degC"
-        sources["expansion of the scales"] = _expansion(settings.expansion)
-    return Redrawing(reduced, settings.model_copy(update=quiet), sources)
+    """Return the readings without outliers, and their sources: noise and repeatability, drift, scales, expansion."""
+    state = estimated(raw, settings)
+    network, problem = state.network, state.network.fit.problem
+    sd = state.factor * np.asarray(problem.noise.sd)
+    sources = {
+        READINGS: Redraw(_noise(sd), groups=(STATIONS, REPEATABILITY, UNEXPLAINED), own=True),
+        **{name: Redraw(standard_draw(name, n), groups=(name,)) for name, n in independent_draws(problem).items()},
+    }
+    if state.settings.together and state.machine.variance > 0:
+        sources[REPEATABILITY] = Redraw(act=_positions(state.machine.value), own=True)
+
+    def trial(data: xr.Dataset, _: Settings) -> xr.Dataset:
+        drawn = {name: np.asarray(data[name].values) for name in independent_draws(problem) if name in data}
+        if DRIFT in drawn:  # it follows from readings, whose noise is larger by this factor
+            drawn[DRIFT] = drawn[DRIFT] * state.factor
+        found = fitted_again(network, moved(problem, data[READINGS].values, drawn))
+        return replaced(errors, dict(zip(XYZ, (found - network.nominal).T, strict=True)))
+
+    return Redrawing(xr.Dataset({READINGS: ("reading", problem.readings)}), settings, sources, identify=trial)
 
 
-def _displacement(raw: xr.Dataset) -> Array:
-    return np.array(raw.variables["displacement"].transpose("station", "target").values, dtype=np.float64)
+def _noise(sd: Array) -> Draw:
+    """Return the noise of the readings, which includes repeatability of separate set-ups."""
+
+    def draw(data: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        return data.assign({READINGS: data[READINGS] + sd * generator.standard_normal(sd.shape)}), settings
+
+    return draw
 
 
-def _with(raw: xr.Dataset, displacement: Array) -> xr.Dataset:
-    return replaced(raw, {"displacement": displacement})
+def _positions(repeatability: float) -> Act:
+    """Return the repeatability of positions that all stations read at the same time."""
 
+    def act(errors: xr.Dataset, generator: np.random.Generator) -> xr.Dataset:
+        shift = repeatability * generator.standard_normal((3, errors.sizes["target"]))
+        return replaced(errors, {name: errors[name].values + each for name, each in zip(XYZ, shift, strict=True)})
 
-def _readings(noise: float) -> Redraw:
-    """Return the noise of the readings, which includes drift and repeatability of separate set-ups."""
-
-    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        d = _displacement(raw)
-        return _with(raw, d + generator.normal(0.0, noise, d.shape)), settings
-
-    return Redraw(draw, groups=(READINGS, REPEATABILITY, UNEXPLAINED, "drift"), own=True)
-
-
-def _positions(repeatability: float, errors: xr.Dataset) -> Redraw:
-    """Return the repeatability of positions read by all stations at the same time: a displacement of the target."""
-    target = errors["target_place"].transpose("target", "direction").values
-    beam = target - errors["station_place"].transpose("station", "direction").values[:, None]
-    beam = np.nan_to_num(beam / np.linalg.norm(beam, axis=2, keepdims=True))
-
-    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        shift = generator.normal(0.0, repeatability, target.shape)
-        return _with(raw, _displacement(raw) + np.einsum("jta,ta->jt", beam, shift)), settings
-
-    return Redraw(draw, own=True)
-
-
-def _scale(relative: float, group: str) -> Redraw:
-    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        return _with(raw, _displacement(raw) * (1.0 + relative * generator.normal())), settings
-
-    return Redraw(draw, groups=(group,))
-
-
-def _expansion(expansion: Expansion) -> Redraw:
-    """Return the source of coefficient and temperature of the scales; an axis has one temperature for all set-ups."""
-
-    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
-        coefficient = expansion.coefficient + expansion.coefficient_uncertainty * generator.normal()
-        shift = expansion.temperature_uncertainty * generator.normal(size=3)
-        moved = raw.variables["scale_temperature"].values + shift
-        changed = expansion.model_copy(update={"coefficient": coefficient})
-        return replaced(raw, {"scale_temperature": moved}), settings.model_copy(update={"expansion": changed})
-
-    return Redraw(draw, groups=("scales",))
+    return act

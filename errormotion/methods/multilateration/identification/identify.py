@@ -44,11 +44,16 @@ def identify_targets(raw: xr.Dataset, settings: Settings, method: str, version: 
     MethodError
         Readings that do not determine the network, contradict one another, or are in another unit.
     """
+    return result(estimated(raw, settings), method, version)
+
+
+def estimated(raw: xr.Dataset, settings: Settings) -> State:
+    """Return the solution of raw data, with what their scatter says about the noise."""
     state = prepare(raw, settings)
     solve(state)
     correct(state)
     evaluate_scatter(state)
-    return result(state, method, version)
+    return state
 
 
 def prepare(raw: xr.Dataset, settings: Settings) -> State:

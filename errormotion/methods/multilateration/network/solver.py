@@ -121,6 +121,14 @@ def at_truth(
         raise _undetermined(linear, given) from error
 
 
+def fitted_again(network: Network, problem: Problem) -> Array:
+    """Return the targets (m, 3), m, of another problem with the same readings used, in the datum; NaN if unknown."""
+    given = _Given(network.reading, network.reading, network.nominal, network.stations, None, None)
+    found = fit(problem, what="the distances", start=network.fit.linear.at)
+    target = _moved(found, given, network.in_datum)[0].unknowns.target
+    return np.where(network.determined[:, None], target, np.nan)
+
+
 @dataclass(frozen=True)
 class _Given:
     """Readings and standard deviations (n, m), nominal targets (m, 3), a start, and stated positions of stations."""
@@ -208,12 +216,12 @@ def _fitted(problem: Problem, given: _Given, at: Unknown | None) -> Fit:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
 
 
-def _moved(found: Fit, given: _Given) -> tuple[Fit, float]:
+def _moved(found: Fit, given: _Given, datum: NDArray[np.bool_] | None = None) -> tuple[Fit, float]:
     """Return a solution moved as a whole to the nominal targets, by values only, and the angle of its rotation, rad.
 
     The rotation is that of Kabsch, from the singular vectors of the cross products.
     """
-    datum = _datum(found)
+    datum = _datum(found) if datum is None else datum
     determinacy.refuse_flat(int(datum.sum()), given.start.position, given.nominal)
     x = found.unknowns
     a, b = x.target[datum].mean(axis=0), given.nominal[datum].mean(axis=0)
