@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from errormotion.report import canvas, write_page
+from errormotion.report import canvas, write_page, write_report
 from errormotion.report.document import Figure, Part, Section, Source
 from errormotion.report.drawings.turntable import Dots, Scene, draw
 
@@ -80,3 +80,31 @@ def test_values_zoom_and_space(drift, tmp_path: Path) -> None:
     assert zoomed.startswith("time 25.5")  # the left edge is at 25 min now
     assert by_key.startswith("time 51.0 min;")
     assert (changed, back, drawn, label) == ("true", "true", "true", "Points.")
+
+
+OVERFLOW = """addEventListener("load", () => {
+  const log = document.createElement("pre"), cut = (each) => each.scrollWidth > each.clientWidth + 1;
+  log.id = "log";
+  log.append([...document.querySelectorAll(".table")].filter(cut).map((each) => each.innerText.slice(0, 80)).join("|"));
+  document.body.append(log);
+});"""
+
+
+def test_no_column_of_a_generic_report_is_cut_off(drift, tmp_path: Path) -> None:
+    groups = ["uncertainty of the calibration of all five laser sensors", *drift["source_group"].values[1:]]
+    errors = drift.assign_attrs(method="other", component="C").assign_coords(source_group=("source", groups))
+    page = write_report(errors, tmp_path / "page.html")
+    html = page.read_text(encoding="utf-8")
+    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", html)  # for the script of the test
+    page.write_text(html.replace("</body>", f"<script>{OVERFLOW}</script></body>"), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    done = subprocess.run(
+        [str(BROWSER), *options, "--window-size=1200,900", "--dump-dom", page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    found = re.search(r'<pre id="log">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert found is not None
+    assert found[1] == ""

@@ -53,6 +53,11 @@ def last_place(errors: xr.Dataset) -> list[int]:
     return [errors.sizes[dim] - 1 for dim in errors.em.dims]
 
 
+def _at(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
+    place = place_of(errors, dims, index)
+    return f"at {place}" if place else ""
+
+
 @dataclass(frozen=True)
 class Budget:
     """The uncertainty budget of the errors at one place.
@@ -62,13 +67,13 @@ class Budget:
     at : callable
         Returns the indices of the place along the dims of the errors, None for no budget; by default the last place.
     place : callable
-        ``place(dataset, dims, index)``: the place in words; by default in field units.
+        ``place(dataset, dims, index)``: the place in words; by default ``at`` it in field units.
     noise : str
         Name of the part that is independent from place to place.
     """
 
     at: Callable[[xr.Dataset], Sequence[int] | None] = last_place
-    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = place_of
+    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = _at
     noise: str = ""
 
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
@@ -86,7 +91,7 @@ class Budget:
             along = " and ".join(WORDS.get(dim, dim) for dim in dims)
             noise = f"noise, independent from {along} to {along}"
         here = errors.isel(dict(zip(dims, index, strict=True)))
-        return [budget.table(here, f"at {place}" if place else "", noise or budget.readable("independent"))]
+        return [budget.table(here, place, noise or budget.readable("independent"))]
 
 
 @dataclass(frozen=True)

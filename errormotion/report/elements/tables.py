@@ -17,6 +17,7 @@ from errormotion.report.text import DASH, fixed, integer, percent, significant
 
 MISSING = "not part of this result"
 """Reason of a dash where the dataset lacks a variable."""
+
 _MOST = 240
 """Rows of a table; more are in the dataset."""
 
@@ -66,15 +67,15 @@ class Column(Of):
         """Return the head of the column."""
         name = self.head or (quantity.name if quantity is not None else str(self.variable))
         unit = quantity.unit if quantity is not None else ""
-        if unit and self.format != "percent" and " / " not in name:
+        if unit and self.format != "percent" and "/" not in name and unit not in name:
             return f"{name} / {unit}"
         return name
 
-    def cell(self, value: float, u: float, reason: str) -> Cell:
-        """Return a cell; value and standard uncertainty in the unit of the column."""
+    def cell(self, value: float, u: float | None, reason: str) -> Cell:
+        """Return a cell; value and standard uncertainty in the unit of the column, None if it has no uncertainty."""
         if not np.isfinite(value):
             return Cell(DASH, reason=reason)
-        if np.isfinite(u) and not self.format:
+        if u is not None and not self.format:
             return estimate(value, 2 * u, signed=self.signed)
         if callable(self.format):
             return Cell(self.format(value))
@@ -82,9 +83,15 @@ class Column(Of):
             return Cell(fixed(value, int(self.format[1:]), signed=self.signed))
         if self.format in FORMATS:
             return Cell(FORMATS[self.format](value))
-        digits = int(self.format or 4)
-        text = significant(value, digits)
-        return Cell(f"+{text}" if self.signed and value > 0 and not text.startswith("+") else text)
+        text = significant(value, int(self.format or 4))
+        return Cell(f"+{text}" if self.signed and value > 0 else text)
+
+
+def _name_of(ds: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
+    """Return a place in field units; along a single coordinate of texts its text alone, as the head names the dim."""
+    if len(dims) == 1 and dims[0] in ds.coords and ds[dims[0]].dtype.kind in "UO":
+        return str(ds[dims[0]].values[index[0]])
+    return place_of(ds, dims, index)
 
 
 @dataclass(frozen=True)
@@ -102,8 +109,11 @@ class Table:
         Dims of the rows; the first of several dims groups the rows, unless it has a single place.
     head : str
         Name of the first column; by default that of the last dim.
+    of : callable
+        Returns the dataset that the table reads, made from that of the result; None for no table.
     place : callable
-        ``place(dataset, dims, index)``: a row's name; by default the places along the dims in field units.
+        ``place(dataset, dims, index)``: a row's name; by default the places along the dims in field units, or the text
+        of a coordinate.
     where : callable
         Returns which rows are shown, a `DataArray` of bool over the dims of the rows.
     groups : sequence of (str, int)
@@ -118,7 +128,8 @@ class Table:
     columns: Sequence[Column]
     over: str | Sequence[str]
     head: str = ""
-    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = place_of
+    of: Callable[[xr.Dataset], xr.Dataset | None] | None = None
+    place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] | None = None
     where: Callable[[xr.Dataset], xr.DataArray] | None = None
     groups: Sequence[tuple[str, int]] = ()
     notes: Sequence[str | Callable[[xr.Dataset], Sequence[str]]] = ()
@@ -126,11 +137,14 @@ class Table:
 
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
         """Return the table; a note or nothing without its variables."""
-        ds = source.errors
+        ds = source.errors if self.of is None else self.of(source.errors)
+        if ds is None:
+            return [Text(self.absent, "note")] if self.absent else []
         over = [self.over] if isinstance(self.over, str) else list(self.over)
         found = [column.read(ds) for column in self.columns]
         if not any(found) or not set(over) <= set(map(str, ds.sizes)):
             return [Text(self.absent, "note")] if self.absent else []
+        place = self.place or _name_of
         shape = [ds.sizes[dim] for dim in over]
         shown = np.ones(shape, bool)
         if self.where is not None:
@@ -144,9 +158,9 @@ class Table:
         for index in indices[:_MOST]:
             if len(over) > 1 and shape[0] > 1 and index[0] != last:
                 last = index[0]
-                rows.append([self.place(ds, over[:1], index[:1])])
+                rows.append([place(ds, over[:1], index[:1])])
             own = slice(1, None) if len(over) > 1 else slice(None)
-            name = self.place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
+            name = place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
             rows.append([name, *_once([column[tuple(index)] for column in made])])
         heads = [column.title(each) for column, each in zip(self.columns, found, strict=True)]
         more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
@@ -185,16 +199,16 @@ def _column(
     for index in np.ndindex(*shape):
         each = values[index]
         if each.dtype.kind in "UO":
-            cells[index] = Cell(str(each.ravel()[0]))
+            cells[index] = Cell(text) if (text := str(each.ravel()[0])) else Cell(DASH, reason=column.reason)
             continue
         why = column.reason if reasons is None else str(reasons[index].ravel()[0]) or "not determined"
         numbers = np.asarray(each, dtype=float).ravel() / quantity.size
         if column.reduce:
             known = numbers[np.isfinite(numbers)]
             number = REDUCTIONS[column.reduce](known) if known.size else np.nan
-            cells[index] = column.cell(number, np.nan, why)
+            cells[index] = column.cell(number, None, why)
         else:
-            spread = np.nan if u is None else float(u[index].ravel()[0]) / quantity.size
+            spread = None if u is None else float(u[index].ravel()[0]) / quantity.size
             cells[index] = column.cell(float(numbers[0]), spread, why)
     return cells
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -287,10 +286,7 @@ def _uncertainty(errors: xr.Dataset, beam: BeamView) -> list[Block]:
     point = ", ".join(fixed(1e3 * float(value), 3) for value in np.atleast_1d(errors.attrs["functional_point"]))
     blocks: list[Block] = []
     if "influence" in errors and beam.known:
-        table = budget.table(here, f"of the beam '{beam.name}'")
-        independent = budget.readable("independent")
-        rows = [[_INDEPENDENT if row[0] == independent else row[0], *row[1:]] for row in table.rows]
-        blocks.append(replace(table, rows=rows))
+        blocks.append(budget.table(here, f"of the beam '{beam.name}'", _INDEPENDENT))
     else:
         blocks.append(_freedoms(here))
     blocks.append(

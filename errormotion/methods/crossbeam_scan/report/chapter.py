@@ -82,7 +82,7 @@ def _at(errors: xr.Dataset) -> Sequence[int] | None:
 
 def _where(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
     at = dict(zip(dims, index, strict=True))
-    return f"{campaign(errors).where(at['time'], at['position'])} of warm-up"
+    return f"at {campaign(errors).where(at['time'], at['position'])} of warm-up"
 
 
 def _position(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:  # noqa: ARG001 - one dim
@@ -217,7 +217,7 @@ CHAPTER = Chapter(
                 On(lambda errors: _several(2, 2, errors), (SURFACES,)),
                 On(lambda errors: _several(1, 2, errors), (ALONG,)),
                 On(lambda errors: _several(2, 1, errors), (OVER_TIME,)),
-                On(_last, (Table(LAST, SIX, over="position", place=_position),)),
+                Table(LAST, SIX, over="position", of=_last, place=_position),
             ),
         ),
         Section("registration", "One registration", (Own(registration.blocks),)),

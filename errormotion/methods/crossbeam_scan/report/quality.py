@@ -23,7 +23,7 @@ from errormotion.methods.crossbeam_scan.report.view import (
 from errormotion.report import quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Source, Text
-from errormotion.report.elements import Column, On, Table
+from errormotion.report.elements import Column, Table
 from errormotion.report.fields import field, remarks
 from errormotion.report.text import finite, fixed, integer, listed, significant
 
@@ -164,34 +164,25 @@ def _reasons(errors: xr.Dataset) -> list[str]:
 
 
 TABLES = (
-    On(
-        _rows(single=True),
-        (
-            Table(
-                "Quality of every registration, by warm-up time and position.",
-                COLUMNS,
-                over=AXES,
-                head="artefact",
-                place=_row,
-                groups=_GROUPS,
-                notes=(_NOTE,),
-            ),
-        ),
+    Table(
+        "Quality of every registration, by warm-up time and position.",
+        COLUMNS,
+        over=AXES,
+        head="artefact",
+        place=_row,
+        groups=_GROUPS,
+        notes=(_NOTE,),
+        of=_rows(single=True),
     ),
-    On(
-        _rows(single=False),
-        (
-            Table(
-                "Quality of the registrations: the worst of each cycle (of the points: the fewest), and how many were "
-                "made.",
-                COLUMNS,
-                over="time",
-                head="cycle",
-                place=_cycle,
-                groups=_GROUPS,
-                notes=(_NOTE, _reasons),
-            ),
-        ),
+    Table(
+        "Quality of the registrations: the worst of each cycle (of the points: the fewest), and how many were made.",
+        COLUMNS,
+        over="time",
+        head="cycle",
+        place=_cycle,
+        groups=_GROUPS,
+        notes=(_NOTE, _reasons),
+        of=_rows(single=False),
     ),
 )
 
@@ -274,21 +265,16 @@ def _repeated(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> 
 
 
 REPEATS = (
-    On(
-        _known_repeats,
-        (
-            Table(
-                "Cold repeat: the six errors between two scans of the cold machine, which are zero if machine and "
-                "artefacts did not change. After ±: expanded uncertainty, k = 2.",
-                tuple(
-                    Column("cold_repeat", select={"dof": name}, reason="no cold repeat of this artefact")
-                    for name in FREEDOMS
-                ),
-                over=("repeat", "position"),
-                head="artefact",
-                place=_repeated,
-            ),
+    Table(
+        "Cold repeat: the six errors between two scans of the cold machine, which are zero if machine and "
+        "artefacts did not change. After ±: expanded uncertainty, k = 2.",
+        tuple(
+            Column("cold_repeat", select={"dof": name}, reason="no cold repeat of this artefact") for name in FREEDOMS
         ),
+        over=("repeat", "position"),
+        head="artefact",
+        place=_repeated,
+        of=_known_repeats,
     ),
 )
 
