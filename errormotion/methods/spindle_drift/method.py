@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.spindle_drift.schema import SCHEMA
@@ -145,6 +145,17 @@ class SpindleDrift(ModelMethod):
         from errormotion.methods.spindle_drift.planning import expected
 
         return expected(settings)
+
+    def planning_settings(self, settings: DriftSettings, instruments: Mapping[str, Any]) -> DriftSettings:
+        """Return the settings with bar, levels, noise and expansion of the frame on the bench, where none is stated."""
+        frame = instruments.get("spindle_frame")
+        names = {"bar_radius": "bar_radius", "levels": "levels", "noise": "noise"}
+        if "thermometer" in instruments:  # otherwise the expansion is not corrected
+            names["frame_expansion"] = "expansion"
+        found = {name: getattr(frame, own, None) for name, own in names.items()}
+        stated = settings.layout.model_fields_set
+        update = {name: value for name, value in found.items() if value is not None and name not in stated}
+        return settings.model_copy(update={"layout": settings.layout.model_copy(update=update)})
 
     def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""

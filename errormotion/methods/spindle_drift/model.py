@@ -280,6 +280,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         shared=REFERENCE,
         what="the readings of the bar",
         robust=False,  # as many readings as unknowns: nothing checks them
+        resolution=0.0,  # means of samples; that of single readings is in their stated noise
         finish=result.finish,
         attributes={"reference_interval": result.interval},
         attrs={"reference_time": result.zero, "beams": settings.beams},

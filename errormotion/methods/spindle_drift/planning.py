@@ -21,6 +21,8 @@ _PLANNED = "planned, not measured"
 _TYPICAL_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])  # EX, EY, EZ, m; EA, EB, rad
 _OFF_AXIS = 30e-6
 """Distance along X and Y from the axis of the bar to the functional point, whose coordinates are rounded, m."""
+_AXES = np.array([0, 0, 1, 1, 2])
+"""Direction in which the sensor of each channel is displaced by the expansion of the frame."""
 _LATER = 3600.0
 """Time of the planned instant after the reference state, s."""
 
@@ -53,7 +55,8 @@ def _expected_drift(settings: Settings) -> xr.Dataset:
     """Return the means of the reference state, and of one later instant.
 
     The beams are those of a detection with the stated steps. The later instant has a typical drift (5 um in X and Y,
-    20 um in Z, 0.1 mrad), because the effect of the uncertainty of the beams increases with the drift.
+    20 um in Z, 0.1 mrad), because the effect of the uncertainty of the beams increases with the drift, and a frame
+    that has become warmer, if its expansion is stated.
     """
     p = settings.layout
     origin, direction = _frame(settings)
@@ -81,7 +84,12 @@ def _expected_drift(settings: Settings) -> xr.Dataset:
         "distance_noise": p.noise / np.sqrt(samples),
         "level": ("height", zs),
     }
-    return xr.Dataset(variables, {**_LABELS, "time": time}, _ATTRS)
+    if any(p.frame_expansion):
+        warm = np.where(time < time[-1], 20.0, 20.0 + p.frame_warming)
+        variables["frame_expansion"] = (("channel", "direction"), np.eye(3)[_AXES] * p.frame_expansion)
+        variables["temperature"] = (("time", "sensor"), warm[:, None])
+    labels = {**_LABELS, "time": time, "sensor": [settings.frame_temperature]}
+    return xr.Dataset(variables, labels, _ATTRS)
 
 
 def _expected_beams(settings: Settings) -> xr.Dataset:

@@ -91,12 +91,17 @@ class Result:
     def finish(self, solved: Solved) -> Solved:
         """Return a solution whose instants of the reference state share its noise, with all further results."""
         errors = solved.relative.errors
+        of_reference = self._of_reference(solved)
+        sources = [*of_reference, *(source for source in errors.sources if source.group != REFERENCE)]
+        m = self.reference.size
+        # What each mean does not share with the mean of all; a single one is 0 by definition.
         own = errors.own.copy()
-        own[self.reference] *= 1.0 - 1.0 / self.reference.size  # what each mean does not share with the mean of all
-        sources = [*self._of_reference(solved), *(source for source in errors.sources if source.group != REFERENCE)]
-        for source in sources:
+        own[self.reference] *= 1.0 - 1.0 / m
+        for source in sources if m == 1 else of_reference:
             source.effect[self.reference] = 0.0
-        errors = replace(errors, own=own, sources=sources)
+        value = errors.value.copy()
+        value[self.reference] *= 0.0 if m == 1 else 1.0
+        errors = replace(errors, value=value, own=own, sources=sources)
         names = [source.name for source in sources if source.group == REFERENCE]
         observed = solved.observed
         observed = replace(observed, attributes={**observed.attributes, "reference_sources": names})

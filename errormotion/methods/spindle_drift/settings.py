@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from errormotion.datasets.units import Angle, Frequency, Length, Speed, Time
+from errormotion.datasets.units import Angle, Expansion, Frequency, Length, Speed, Time
 from errormotion.plugins import PluginSettings
 
 
@@ -39,6 +39,10 @@ class Layout(PluginSettings):
     step_noise: Length = Field(
         default=0.6e-6, gt=0, description="standard deviation of one step's mean in a beam detection"
     )
+    frame_expansion: tuple[Expansion, Expansion, Expansion] = Field(
+        default=(0.0, 0.0, 0.0), description="displacement of the X, Y and Z sensors per kelvin of the frame"
+    )
+    frame_warming: float = Field(default=1.0, ge=0, description="change of the temperature of the frame, K")
 
 
 class Settings(PluginSettings):

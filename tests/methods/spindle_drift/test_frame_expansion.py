@@ -52,3 +52,11 @@ def test_a_thermometer_without_noise_has_no_sources():
     shared, own = smoothing_sources(LocalLine(TIME, KNOWN, LENGTH), 0.0, TIME, np.array([0]))
     assert not shared
     assert not own.any()
+
+
+def test_a_gap_in_the_record_is_no_noise():
+    """The temperature before and after a gap of an hour differs by a kelvin, that of neighbours by 0.01 K."""
+    time = np.concatenate([10.0 * np.arange(40), 4000.0 + 10.0 * np.arange(40)])
+    values = np.where(time < 2000.0, 20.0, 21.0) + np.random.default_rng(2).normal(0.0, 0.01, time.size)
+    smoothing = LocalLine(time, np.ones(time.size, bool), LENGTH)
+    assert smoothing.noise(values, smoothing(values)) == pytest.approx(0.01, rel=0.5)

@@ -5,8 +5,10 @@ import pytest
 
 from errormotion.errors import MethodError
 from errormotion.estimation.derivatives import along, by_rows
+from errormotion.instruments.spindle_frame.settings import FrameSettings
 from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
 from errormotion.methods.spindle_drift.model import observe
+from errormotion.montecarlo.trials import redrawing_of, trial
 from errormotion.twin import Event, VirtualMachine
 
 TIMES = 10.0 * np.arange(60)
@@ -106,3 +108,77 @@ def test_precise_readings_far_from_the_origin_of_the_machine_are_solved(machine,
     raw["level"] = raw["level"] + shift
     errors = SpindleDrift().identify(raw, Settings(noise="stated"))
     assert np.isfinite(errors["EX"].values).all()
+
+
+def test_errors_within_a_reference_state_of_several_means_have_their_spread(warming):
+    """By draws: each mean shares its noise with the reference state, and the temperature of the frame differs."""
+    method = SpindleDrift()
+    settings = Settings(reference_time=0.0, reference_average=100.0, noise="stated", functional_point=(0.0, 0.0, 0.0))
+    errors = method.identify(warming, settings)
+    redrawing = redrawing_of(method, warming, settings, errors)
+    draws = [trial(method, redrawing, np.random.SeedSequence(k)).em.twist().values[:11, :5] for k in range(150)]
+    u = np.sqrt(np.diagonal(errors["covariance"].values, axis1=1, axis2=2))[:11, :5]
+    # Of 150 draws 6 % is chance, and 4 times as much in 55 values.
+    np.testing.assert_allclose(np.std(draws, axis=0, ddof=1) / u, 1.0, atol=0.24)
+
+
+def test_a_single_mean_as_the_reference_state_is_exactly_0(warming):
+    errors = SpindleDrift().identify(warming)
+    assert (errors.em.twist().values[0, :5] == 0.0).all()
+    assert (errors["covariance"].values[0, :5, :5] == 0.0).all()
+    assert (errors["influence"].isel(time=0, dof=slice(0, 5)) == 0.0).all()
+
+
+EXPANDING = {"frame_expansion": (2.1e-6, 2.4e-6, 1.3e-6)}
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Settings(),
+        Settings(layout=EXPANDING, bar_radius_uncertainty=1e-6),
+        Settings(layout=EXPANDING, reference_time=60.0, reference_average=30.0),
+        Settings(beams="nominal"),
+        Settings(procedure="beam_detection"),
+    ],
+    ids=["plain", "expanding", "averaged", "nominal", "beams"],
+)
+def test_plan_is_the_identification_of_the_expected_data(settings):
+    method = SpindleDrift()
+    planned, found = method.plan(settings), method.identify(method.expected(settings), settings)
+    if "source_group" in found:
+        assert planned["source_group"].values.tolist() == found["source_group"].values.tolist()
+    np.testing.assert_allclose(planned["covariance"], found["covariance"], rtol=1e-9, atol=1e-30)
+    assert not np.nan_to_num(planned.em.twist().values).any()
+
+
+def test_plan_of_a_frame_that_expands_states_the_largest_part_of_the_uncertainty():
+    """A tenth of 2.1 um: without it, the plan of EX is 5 nm."""
+    u = [
+        np.sqrt(SpindleDrift().plan(Settings(layout=layout))["covariance"].values[-1, 0, 0])
+        for layout in ({}, EXPANDING)
+    ]
+    assert u[0] < 10e-9
+    assert u[1] == pytest.approx(0.1 * 2.1e-6, rel=0.05)
+
+
+def test_a_longer_reference_state_decreases_its_planned_part():
+    plans = [SpindleDrift().plan(Settings(reference_average=length)) for length in (0.5, 50.0)]
+    parts = []
+    for plan in plans:
+        rows = plan["influence"].values[plan["source_group"].values == "reference state"]
+        parts.append(np.linalg.norm(rows[:, -1, :3]))
+    assert parts[1] == pytest.approx(parts[0] / 10.0, rel=1e-3)
+
+
+def test_the_plan_of_a_campaign_has_the_frame_of_the_bench():
+    method = SpindleDrift()
+    frame = FrameSettings(expansion=(2.1e-6, 2.4e-6, 1.3e-6), bar_radius=6e-3)
+    warm = method.planning_settings(Settings(), {"spindle_frame": frame, "thermometer": object()}).layout
+    assert warm.frame_expansion == frame.expansion
+    assert (warm.bar_radius, warm.levels, warm.noise) == (6e-3, frame.levels, frame.noise)
+    # Without a thermometer nothing is corrected; what the campaign states is kept.
+    assert method.planning_settings(Settings(), {"spindle_frame": frame}).layout.frame_expansion == (0.0, 0.0, 0.0)
+    stated = method.planning_settings(Settings(layout={"bar_radius": 4e-3}), {"spindle_frame": frame}).layout
+    assert stated.bar_radius == 4e-3
+    assert method.planning_settings(Settings(), {}).layout == Settings().layout

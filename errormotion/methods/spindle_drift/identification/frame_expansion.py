@@ -144,10 +144,12 @@ class LocalLine:
                     break
                 repeats += 2.0 * lag / lags[0]
         variance = float(np.mean(residual**2)) * repeats
-        if np.median(np.diff(self._time[self.known])) <= self.length:
-            # In a window with few values, second differences give the noise; at longer intervals they would include
-            # the warming.
-            variance = max(variance, float(np.mean(np.diff(values[self.known], 2) ** 2)) / 6.0)
+        # In a window with few values, second differences give the noise; at longer intervals they would include the
+        # warming.
+        close = np.diff(self._time[self.known]) <= self.length
+        close = close[1:] & close[:-1]
+        if close.any():
+            variance = max(variance, float(np.mean(np.diff(values[self.known], 2)[close] ** 2)) / 6.0)
         return float(np.sqrt(variance))
 
 
