@@ -37,9 +37,9 @@ def untranslated(plugin: Any, dataset: xr.Dataset, raw: xr.Dataset | None = None
     found = provenance.read(dataset) if "provenance" in dataset.attrs else {}
     source = Source(dataset, raw, {}, found)
     with written_in(language):
-        own = list(plugin().chapters(source))
+        own = list(plugin.chapters(source))
         parts = own or chapters(source)
-    texts = plugin().texts(language)
+    texts = plugin.texts(language)
     return missing_of(parts, annex.values([source]), language, [texts])
 
 
