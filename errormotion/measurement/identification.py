@@ -38,7 +38,7 @@ from errormotion.measurement.noise import (
 from errormotion.measurement.observed import Model, Observed, Solved
 from errormotion.plugins import MethodInfo
 
-__all__ = ["Solved", "dataset", "identify", "solve"]
+__all__ = ["Solved", "dataset", "identify", "of_readings", "solve"]
 
 
 def solve(observed: Observed) -> Solved:
@@ -182,7 +182,9 @@ def dataset(
     """Return the error dataset of a solution; with ``planned`` its values are 0 where they are known."""
     observed, datum = solved.observed, solved.relative
     shape = _shape(observed)
-    notes = [*observed.notes, solved.scatter.note] if not planned else [*observed.notes]
+    notes, doubts = [*observed.notes], [*observed.doubts]
+    if not planned:
+        (doubts if solved.scatter.doubtful else notes).append(solved.scatter.note)
     if planned:
         zero = np.where(np.isfinite(datum.errors.value), 0.0, np.nan)
         datum = replace(datum, errors=replace(datum.errors, value=zero), coefficient=0.0 * datum.coefficient)
@@ -202,9 +204,11 @@ def dataset(
         "sources": names,
         "source_groups": [source.group for source in errors.sources],
         "source_ids": {name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
-        "extras": dict(observed.extras) | _of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum)),
+        "extras": dict(observed.extras) | of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum)),
         "start": "" if planned else start_of(raw, observed.zero),
         "measured": None if planned else raw.attrs,
+        "notes": notes,
+        "doubts": doubts,
         **observed.attributes,
     }
     if observed.sensitivity is not None:
@@ -222,10 +226,10 @@ def dataset(
             influence=_placed(errors.influence, observed, (len(names), *shape)),
             **common,
         )
-    return found.assign_attrs(observed.attrs, notes=[note for note in notes if note] or [""])
+    return found.assign_attrs(observed.attrs)
 
 
-def _of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
+def of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     """Return residuals, exclusions and reliability of the readings, over their dims in the raw data."""
     recorded, given = solved.observed.recorded, solved.given
     if recorded is None or not solved.observed.reliability or solved.white.residual.size != given.readings.size:

@@ -45,6 +45,8 @@ _FALSE_NOTE = 0.01
 """Probability of a note on a correlation of white noise."""
 _FEW = 8.0
 """Independent readings below which the size of a correlated noise is hardly known."""
+_NOTHING = 1e-3
+"""Scatter, relative to a stated noise, below which readings are expected ones and say nothing about their noise."""
 _COARSE = 0.5
 """Noise in steps of the scale from which rounding is a part of the scatter."""
 _LITTLE = 0.5
@@ -105,7 +107,9 @@ def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
         return Neighbours()
     if observed.correlation is not None:
         return Neighbours(observed.correlation)
-    along = correlated(found, observed.order, observed.series)
+    if found.problem.noise.stated and found.chi2 < _NOTHING**2 * found.freedom:
+        return Neighbours()
+    along = correlated(_of_unknown_noise(observed, found), observed.order, observed.series)
     if not along.phi > 0:
         return Neighbours()
     note = doubt = ""
@@ -119,6 +123,20 @@ def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
         else:
             note = f"{what}; the uncertainties contain it."
     return Neighbours(along.phi, along.u_phi, note, doubt)
+
+
+def _of_unknown_noise(observed: Observed, found: Fit) -> Fit:
+    """Return the fit with a noise of unknown size: one that is stated wrongly must not look like a correlation.
+
+    Beside priors the size cannot be left open, and is that of the residuals.
+    """
+    problem = found.problem
+    if not problem.noise.stated:
+        return found
+    if has_priors(problem):
+        return estimated_noise(found, refresh=observed.refresh, what=observed.what)[0]
+    unknown = replace(problem, noise=replace(problem.noise, stated=False))
+    return fit(unknown, refresh=observed.refresh, what=observed.what, start=found.linear.at)
 
 
 def fitted(observed: Observed, problem: Problem, before: Fit) -> Fit:

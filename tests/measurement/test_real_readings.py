@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.datasets import provenance
 from errormotion.errors import MethodError
-from errormotion.measurement.identification import solve
+from errormotion.measurement.identification import dataset, solve
 from tests.measurement.test_model import Drift, DriftSettings
 from tests.measurement.test_solution import POSITION, SLOPE, N, observed
 
@@ -97,3 +98,27 @@ def test_a_correlation_over_most_of_the_test_doubts_an_estimated_noise() -> None
     strong = solve(replace(observed(along(3, 0.97), None), order=POSITION))
     assert any("may be too small" in note for note in strong.observed.doubts)
     assert not any(solve(replace(observed(along(3, 0.0), None), order=POSITION)).observed.doubts)
+
+
+def test_a_noise_that_is_stated_wrongly_is_no_correlation() -> None:
+    """Noise of a third and of three times the stated size, 60 series each; the note has a probability of 1 %."""
+    for stated in (0.5e-6 / 3, 1.5e-6):
+        found = [solve(replace(observed(along(seed, 0.0), stated), order=POSITION)) for seed in range(60)]
+        assert sum(any("correlated" in note for note in each.observed.notes) for each in found) <= 4
+
+
+def test_expected_readings_show_no_correlation() -> None:
+    exact = solve(replace(observed(np.zeros(N), 0.5e-6), order=POSITION))
+    assert exact.observed.correlation == 0.0
+    assert exact.relative.errors.own == pytest.approx(solve(observed(np.zeros(N), 0.5e-6)).relative.errors.own)
+
+
+def test_doubts_are_those_of_the_result() -> None:
+    raw, _, settings = rounded(1, 1e-6, 0.0, stated=True)
+    raw["reading_noise"] = raw["reading_noise"] / 5
+    errors = METHOD.identify(raw, settings)
+    assert not errors.em.doubts  # the uncertainties are increased
+    model = METHOD.observe(raw, settings)
+    unchanged = solve(replace(model, noise_increases=False, robust=False))
+    result = dataset(METHOD, unchanged, raw, METHOD.info, provenance.make(settings, raw, None, steps=["test"]))
+    assert any("the stated noise is used" in note for note in result.em.doubts)
