@@ -215,9 +215,14 @@ def _whitened(linear: Linear) -> Array:
 
 
 def _unit(linear: Linear) -> float:
-    """Return the variance factor of the readings, at least that of the rounding of their numbers."""
+    """Return the variance factor of the readings, at least that of the rounding of their numbers.
+
+    Readings that contradict a stated noise cannot be fitted to a fraction of it: their second derivatives, which the
+    steps neglect, are multiplied by the residuals.
+    """
     used = max(int(linear.used.sum()), 1)
-    return max(1.0 if linear.problem.noise.stated else linear.chi2 / used, linear.rounding / used)
+    least = 1.0 if linear.problem.noise.stated else 0.0
+    return max(least, linear.chi2 / used, linear.rounding / used)
 
 
 def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:

@@ -48,8 +48,8 @@ class Problem:
         Changes of unknowns by name that no reading sees, such as a motion of a whole network.
     derivatives : callable, optional
         ``derivatives(y, x, c)`` returns analytic derivatives of the residuals, (n, m, width) or (n, m, w, width), by
-        name, for any of the unknowns, and as `READINGS` those by the numbers of the readings, (n, m, r); those of the
-        others are differences.
+        name, for any of the unknowns and of the adjusted constants, and as `READINGS` those by the numbers of the
+        readings, (n, m, r); those of the others are differences.
     constant_derivatives : callable, optional
         The same for any of the constants that are not adjusted.
     """
@@ -509,16 +509,17 @@ def _derivatives(problem: Problem, tables: list[Table], values: list[Array], giv
     (n, m, w, width); w = 1 for a sum of rows.
     """
     count = len(problem.unknowns)
+    names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
+    needed = [*range(count), *(count + k for k in problem.adjusted)]
     known: dict[int, Array] = {}
-    for k, name in enumerate(problem.unknowns._fields):
-        if name not in given:
-            continue
-        J = given[name]
-        known[k] = J[:, :, None, :] if J.ndim == 3 else J
-    wanted = [k for k in range(count) if k not in known] + [count + k for k in problem.adjusted]
+    for k in needed:
+        if names[k] in given:
+            J = given[names[k]]
+            known[k] = J[:, :, None, :] if J.ndim == 3 else J
+    wanted = [k for k in needed if k not in known]
     found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted, weighed=False)
     by_number = {**known, **dict(zip(wanted, found, strict=True))}
-    return [by_number[k] for k in [*range(count), *(count + k for k in problem.adjusted)]]
+    return [by_number[k] for k in needed]
 
 
 def by_slot(J: Array, table: Table) -> Array:

@@ -69,25 +69,17 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     Raises
     ------
     ValueError
-        The model does not state which variable the readings are (`Observed.recorded`).
+        The model does not state which variable the readings are (`Observed.recorded`), or how they are recorded.
     """
     generator = np.random.default_rng(seed)
     raw = model.expected(settings)
     observed = model.observe(raw, settings)
-    if observed.recorded is None:
-        raise ValueError("simulate: expected a model that states 'recorded', the variable of its readings")
     problem = observed.problem
     exact = solve(as_expected(observed))
     drawn = {name: generator.standard_normal(number) for name, number in independent_draws(problem).items()}
     true = moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)
-    root = np.linalg.cholesky(problem.noise.covariance(column(y).shape))
-    noisy = column(y) + (root @ generator.standard_normal((*column(y).shape, 1)))[..., 0]
-    name, dims = observed.recorded
-    shape = [raw.sizes[dim] for dim in dims]
-    values = np.where(np.isfinite(column(problem.readings)), noisy, np.nan).reshape(shape)
-    order = raw[name].dims
-    measured = raw.assign({name: xr.DataArray(values, dims=dims, attrs=raw[name].attrs).transpose(*order)})
+    measured = _recorded(observed, raw, y, generator)
     truth = dataset(model, exact, raw, info, provenance.make(settings, None, None, steps=["simulation"], seed=seed))
     zero = truth.copy()
     for key in ("covariance", "influence", "deviation_variance", "deviation_influence"):
@@ -95,6 +87,22 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
             zero[key] = zero[key].copy(data=np.where(np.isfinite(zero[key].values), 0.0, np.nan))
     made = json.dumps([{"id": f"model of {info.id}", "simulated": True}])
     return measured.assign_attrs(machine="simulated", instruments=made), zero.assign_attrs(machine="simulated")
+
+
+def _recorded(observed: Observed, raw: xr.Dataset, y: Array, generator: np.random.Generator) -> xr.Dataset:
+    """Return raw data with readings and their noise."""
+    problem = observed.problem
+    if observed.record is not None:
+        return observed.record(raw, y, generator)
+    if observed.recorded is None:
+        raise ValueError("simulate: expected a model that states 'recorded', the variable of its readings, or 'record'")
+    root = np.linalg.cholesky(problem.noise.covariance(column(y).shape))
+    noisy = column(y) + (root @ generator.standard_normal((*column(y).shape, 1)))[..., 0]
+    name, dims = observed.recorded
+    shape = [raw.sizes[dim] for dim in dims]
+    values = np.where(np.isfinite(column(problem.readings)), noisy, np.nan).reshape(shape)
+    order = raw[name].dims
+    return raw.assign({name: xr.DataArray(values, dims=dims, attrs=raw[name].attrs).transpose(*order)})
 
 
 def independent_draws(problem: Problem) -> dict[str, int]:

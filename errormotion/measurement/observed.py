@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from errormotion.kinematics.iso import DOF
 
 if TYPE_CHECKING:
+    import numpy as np
     import xarray as xr
 
     from errormotion.arrays import Array
@@ -53,6 +54,9 @@ class Observed:
     recorded : tuple of str, and its dims
         The variable of the raw data that the readings are, and the dims in the order of the readings. With it, the
         framework simulates raw data.
+    record : callable, optional
+        For readings that are not a variable of the raw data, such as gradients of them: from raw data, readings without
+        noise in the shape of the problem, and a generator to raw data with noise.
     reliability : bool
         Whether the result has residuals, redundancy and smallest detectable errors of its ``recorded`` readings.
     shared : str
@@ -124,6 +128,7 @@ class Observed:
     datum: Datum | None = None
     sensitivity: Array | None = None
     recorded: tuple[str, tuple[str, ...]] | None = None
+    record: Callable[[xr.Dataset, Array, np.random.Generator], xr.Dataset] | None = None
     reliability: bool = True
     shared: str = "readings"
     what: str = "the readings"

@@ -13,6 +13,7 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation import problem as problems
 from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.checks.correlated import autoregressive
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -395,6 +396,31 @@ def test_derivatives_by_the_readings_may_be_given() -> None:
     assert given.unknowns.line == pytest.approx(expected.unknowns.line)
     assert given.chi2 == pytest.approx(expected.chi2 / 4)  # twice the noise
     assert len(evaluations) <= 8  # no differences
+
+
+def test_derivatives_by_constants_and_readings_may_be_given() -> None:
+    """A line through 1 with an uncertain scale of its readings; also where noise is correlated along it."""
+    x = np.linspace(0, 1, 7)
+    y = 1.02 * (1 + 3 * x) + 0.1 * np.random.default_rng(0).standard_normal(7)
+    line, index = straight(x, y, free=np.array([[False, True]])), np.zeros(7, dtype=int)
+    line = replace(line, unknowns=Line(replace(line.unknowns.line, start=np.array([[1.0, 0.0]]))))
+    gain = Constant(value=np.ones((1, 1)), factor=np.full((1, 1, 1), 0.05), index=index, scale=1.0, adjust=True)
+
+    def equation(y: Array, u: Line[Array], c: Scale[Array]) -> Array:
+        return np.asarray(y - c.scale[:, 0] * (u.line[:, 0] + u.line[:, 1] * x))
+
+    def derivatives(y: Array, u: Line[Array], c: Scale[Array]) -> dict[str, Array]:
+        J = np.stack([np.ones(7), x], axis=1)
+        by_gain = -np.sum(J * u.line, axis=1)[:, None, None]
+        return {"line": -c.scale[:, :, None] * J[:, None], "scale": by_gain, problems.READINGS: np.ones((7, 1, 1))}
+
+    plain = replace(line, equation=equation, constants=Scale(gain))
+    given = replace(plain, derivatives=derivatives)
+    pairs = [(plain, given), (autoregressive(plain, x, 0.5), autoregressive(given, x, 0.5))]
+    for expected, found in ([fit(each) for each in pair] for pair in pairs):
+        assert found.constants.scale == pytest.approx(expected.constants.scale, rel=1e-9)
+        assert found.normal.covariance == pytest.approx(expected.normal.covariance, rel=1e-8)
+        assert expected.constants.scale != pytest.approx(1.0, abs=1e-3)
 
 
 def test_rounding_of_large_readings_does_not_halve_the_steps() -> None:

@@ -184,8 +184,12 @@ def autoregressive(problem: Problem, order: Array, phi: float, series: Index | N
             return {}
         found = {}
         named = problem.named(rows[:count], rows[count:])
+        names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
+        its_table = dict(zip(names, problem.tables, strict=True))
         for name, J in given(y2[:, :r].reshape(problem.readings.shape), *named).items():
-            weight = getattr(problem.unknowns, name).weight
+            if name not in its_table:  # those by the readings
+                continue
+            weight = its_table[name].weight
             whole = J[:, :, None, :] if J.ndim == 3 else J
             whole = whole if weight is None else whole * weight[:, None, :, None]
             found[name] = np.concatenate([whole, -coefficient[:, :, None, None] * whole[chain.before]], axis=2)
