@@ -58,7 +58,9 @@ class Layout(PluginSettings):
     )
     speckle_length: Length = Field(default=50e-6, gt=0, description="correlation length of that error")
     scale_uncertainty: float = Field(
-        default=0.0, ge=0, description="relative standard uncertainty of the sensor's scale, for planning"
+        default=0.0,
+        ge=0,
+        description="relative standard uncertainty of the sensor's scale; a compensation contains it",
     )
 
     # The gauge
@@ -96,6 +98,9 @@ class Layout(PluginSettings):
         description="lengths of the strokes along X, Y and Z, or the longest within range, travel and plate",
     )
     travel: Point = Field(default=(40e-3, 40e-3, 40e-3), description="longest strokes along X, Y, Z")
+    stage_uncertainty: float = Field(
+        default=0.0, ge=0, description="relative standard uncertainty of the scale of each axis of the stage"
+    )
     readings: int = Field(
         default=60, ge=9, description="number of positions on each face, evenly distributed to its three strokes"
     )

@@ -5,24 +5,27 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from errormotion.errors import DatasetError
+from errormotion.measurement.method import ModelMethod
 from errormotion.methods.beam_direction.schema import SCHEMA
 from errormotion.methods.beam_direction.settings import Settings as BeamSettings
-from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, lazy, unarmed
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     import xarray as xr
 
+    from errormotion.measurement.observed import Observed
 
-class BeamDirection(Method):
+
+class BeamDirection(ModelMethod):
     """Origin and direction of the beam of a point sensor, from its readings on planes while a stage moves it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="beam_direction",
         summary="Origin and direction of a point sensor's beam from planes of a sine gauge, inclination compensated",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "the rotation of the beam about its axis",
             "the zero point, if fewer than three planes have a known point",
@@ -37,9 +40,8 @@ class BeamDirection(Method):
     figures = lazy("errormotion.methods.beam_direction.figures:figures")
     calibrations = lazy("errormotion.methods.beam_direction.identification.inclination.figures:CALIBRATIONS")
     motions = lazy("errormotion.methods.beam_direction.motions:steps")
-    simulate = lazy("errormotion.methods.beam_direction.simulation:simulate")
     conformance = lazy("errormotion.methods.beam_direction.conformance:subjects")
-    redrawing = lazy("errormotion.methods.beam_direction.redrawing:redrawing")
+    grows = "plane"
 
     def acquire(
         self,
@@ -84,13 +86,16 @@ class BeamDirection(Method):
         control_of(bench)
         return unarmed(bench, "controller")
 
-    def append_dim(self, settings: BeamSettings) -> str:  # noqa: ARG002 - part of the protocol
-        """Return ``plane``."""
-        return "plane"
-
     def progress(self, settings: BeamSettings) -> float:
         """Return the number of planes."""
         return float(len(settings.planes))
+
+    def observe(self, raw: xr.Dataset, settings: BeamSettings) -> Observed:
+        """Return readings on planes as a model of the beam."""
+        from errormotion.methods.beam_direction.identification.beam import observe
+        from errormotion.methods.beam_direction.identification.sensor import Sensor
+
+        return observe(raw, settings, Sensor.of(raw, settings))
 
     def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
         """Return the error dataset of component ``beam``.
@@ -111,19 +116,18 @@ class BeamDirection(Method):
             The data do not determine the result.
         """
         from errormotion.datasets.validation import checked_raw
-        from errormotion.methods.beam_direction.identification.planes import identify_beam
+        from errormotion.methods.beam_direction.identification.result import identify
 
-        settings = settings or BeamSettings()
-        checked = checked_raw(raw, self)
-        if "distance" not in checked:
-            from errormotion.methods.beam_direction.identification.check_bar.result import identify_bar
-            from errormotion.methods.beam_direction.identification.planes import sensor_of
-
-            return identify_bar(checked, sensor_of(checked, settings), settings, self.info.id, self.info.version)
-        return identify_beam(checked, settings, self.info.id, self.info.version)
+        return identify(self, checked_raw(raw, self), settings or BeamSettings())
 
     def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance."""
+        """Return an error dataset of zeros with the expected covariance, and that of the best set-ups."""
         from errormotion.methods.beam_direction.planning.plan import plan
 
         return plan(self, settings or BeamSettings())
+
+    def expected(self, settings: BeamSettings) -> xr.Dataset:
+        """Return the readings of a nominal beam on the planes of the settings."""
+        from errormotion.methods.beam_direction.planning.plan import expected
+
+        return expected(settings)

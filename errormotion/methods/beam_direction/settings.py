@@ -53,10 +53,6 @@ class Settings(PluginSettings):
         description="standard uncertainty of the angle of the triangulation plane about the beam; used if the data "
         "state none",
     )
-    tolerance: Angle = Field(
-        default=1e-9, gt=0, description="change of the direction at which the compensation has converged"
-    )
-    max_iterations: int = Field(default=30, ge=1, description="largest number of iterations of the compensation")
     robust: bool = Field(default=True, description="ignore and report outliers")
     ordered: bool = Field(
         default=True,

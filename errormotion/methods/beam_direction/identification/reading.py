@@ -67,6 +67,11 @@ class Readings:
     speckle_length: float
     point_uncertainty: float
 
+    @property
+    def has_correlated_speckle(self) -> bool:
+        """Whether the correlation of readings at neighbouring positions is stated."""
+        return self.speckle > 0 and self.speckle_length > 0
+
 
 def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     """Return the readings of a raw dataset; remarks are appended to ``notes``.

@@ -9,59 +9,72 @@ the direction until the planes close.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import chdtri
 
 from errormotion.errors import MethodError
-from errormotion.methods.beam_direction.identification.compensation import Converged, Planes, Sensor, converge
-from errormotion.methods.beam_direction.identification.propagation import (
-    FALSE_ALARM,
-    Propagated,
-    chi2_quantile,
-    closure_chi2,
-    propagate,
-)
+from errormotion.estimation.fit import Fit
+from errormotion.estimation.problem import linearised
+from errormotion.methods.beam_direction.identification.direction import Direction, near
 
-if TYPE_CHECKING:
-    from errormotion.methods.beam_direction.settings import Settings
-
+FALSE_ALARM = 1e-3
+"""Probability that the planes contradict the right side."""
 _NOTED = 2.0
 """Standard uncertainties of the direction from which on the effect of the side is noted."""
 
 
-def check_receiver(
-    planes: Planes, sensor: Sensor, converged: Converged, propagated: Propagated, settings: Settings, notes: list[str]
-) -> None:
+def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
     """Refuse a stated side of the receiver that the planes contradict; note one that they do not confirm.
+
+    Parameters
+    ----------
+    found : Direction
+        With exact constants.
+    closed : Fit
+        With adjusted constants and without known points.
+    notes : list of str
 
     Raises
     ------
     MethodError
         The planes contradict one another with the stated side, and agree with the opposite one.
     """
-    opposite = replace(sensor, triangulation_normal=-sensor.triangulation_normal)
-    try:
-        other = converge(planes, converged.direction.direction, opposite, settings.tolerance, settings.max_iterations)
-    except MethodError:  # no beam fits with the opposite side
+    sensor, u = found.beam.sensor, found.state.direction
+    if sensor is None:
         return
-    freedom = len(planes.names) - 2
-    chi2, chi2_other = closure_chi2(propagated), closure_chi2(propagate(other, None, 0.0))
-    limit = chi2_quantile(1 - FALSE_ALARM, freedom) if freedom > 0 else np.inf
-    turned = float(np.linalg.norm(other.direction.direction - converged.direction.direction))
-    if chi2 > limit >= chi2_other:
+    opposite = replace(sensor, triangulation_normal=-sensor.triangulation_normal)
+    other = near(replace(found.beam, sensor=opposite), u)
+    if other is None:  # no beam fits with the opposite side
+        return
+    mirrored = _adjusted_chi2(other)
+    freedom = len(found.beam.planes.names) - 2
+    limit = float(chdtri(freedom, FALSE_ALARM)) if freedom > 0 else np.inf
+    if closed.chi2 > limit >= mirrored:
         raise MethodError(
-            f"The planes contradict the stated side of the receiver: chi-square of their closure is {chi2:.4g} with "
-            f"it and {chi2_other:.4g} with the opposite one, with {freedom} degree{'s' if freedom > 1 else ''} of "
-            f"freedom; expected less than {limit:.3g}. Check triangulation_normal and receiver on the sensor, and "
+            f"The planes contradict the stated side of the receiver: chi-square of their closure is {closed.chi2:.4g} "
+            f"with it and {mirrored:.4g} with the opposite one, with {freedom} degree{'s' if freedom > 1 else ''} "
+            f"of freedom; expected less than {limit:.3g}. Check triangulation_normal and receiver on the sensor, and "
             f"receiver_rotation of the readings from which calibration '{sensor.calibration.name}' was made."
         )
-    covariance = propagated.covariance[3:, 3:] + propagated.influence[:, 3:].T @ propagated.influence[:, 3:]
-    u = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-    if chi2_other <= limit and turned > _NOTED * u:
+    turned = float(np.linalg.norm(other.state.direction - u))
+    deviation = float(np.sqrt(np.linalg.eigvalsh(found.beam.direction_covariance(closed))[-1]))
+    if mirrored <= limit and turned > _NOTED * deviation:
         notes.append(
             f"The planes do not show on which side of the laser the receiver is; the stated side is used. With the "
             f"opposite one the direction would differ by {np.degrees(turned) * 3600:.3g} arcsec, "
-            f"{turned / u:.2g} standard uncertainties. Planes that are "
+            f"{turned / deviation:.2g} standard uncertainties. Planes that are "
             "turned towards the receiver, away from it and across show it."
         )
+
+
+def _adjusted_chi2(found: Direction) -> float:
+    """Return chi-square with constants that the readings improve, to first order about exact ones.
+
+    With the wrong side they are improved by many standard uncertainties, where the equations bend.
+    """
+    problem = found.adjusted().started(found.fit.unknowns._replace(beam=np.zeros((1, 2)))).problem()
+    linear = linearised(problem, problem.start)
+    normal, a, b = linear.normal()
+    x, z = normal.solve(a[..., None], b[..., None])
+    return linear.chi2 - float(np.vdot(a, x[..., 0]) + b @ z[:, 0])

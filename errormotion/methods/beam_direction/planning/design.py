@@ -218,15 +218,11 @@ def _covariance_of(normals: Array, shares: Array, limits: Limits) -> Array:
         own = own + limits.slope_uncertainty(t) ** 2
     weighted = t / own[:, None]
     information = t.T @ weighted
+    # The scale error s, common to all planes, is estimated with them: V^-1 of the conditions, V = diag(own) + s^2 1 1'.
+    common = weighted.sum(axis=0) * limits.scale_uncertainty
+    information -= np.outer(common, common) / (1 + limits.scale_uncertainty**2 * np.sum(1 / own))
     information += (information[0, 0] + information[1, 1]) * _REGULAR + _TINY
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
-    return np.asarray(covariance + common_scale(covariance, weighted, limits))
-
-
-def common_scale(covariance: Array, weighted: Array, limits: Limits) -> Array:
-    """Return the contribution of a scale error, common to all planes, to the covariance (2, 2) of the angles."""
-    effect = covariance @ weighted.sum(axis=0) * limits.scale_uncertainty
-    return np.outer(effect, effect)
+    return np.asarray(np.linalg.inv(information), np.float64)
 
 
 def worst_angle(covariance: Array) -> float:

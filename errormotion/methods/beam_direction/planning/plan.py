@@ -1,8 +1,12 @@
-"""Expected uncertainty of a measurement, for the set-up of the settings, the published one, and the best one."""
+"""Expected uncertainty of a measurement, for the set-up of the settings, the published one, and the best one.
+
+A plan is the identification of the readings that the set-up is expected to give, so that it has the same sources as a
+measurement.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,25 +14,26 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_errors, provenance
-from errormotion.datasets.calibrations.inclination import InclinationCalibration
+from errormotion.datasets import provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
-from errormotion.kinematics.beams import across, beam_errors, error_jacobian, tilt
-from errormotion.methods.beam_direction.identification.direction import bound
-from errormotion.methods.beam_direction.identification.propagation import Propagated, expected_beam
-from errormotion.methods.beam_direction.identification.reading import NORMAL_NEEDED, with_receiver_right
-from errormotion.methods.beam_direction.identification.slopes import gradient_covariance
+from errormotion.kinematics.beams import across, tilt
+from errormotion.measurement.identification import Solved, dataset, solve
+from errormotion.measurement.observed import as_expected
+from errormotion.methods.beam_direction.identification.beam import observe
+from errormotion.methods.beam_direction.identification.reading import NORMAL_NEEDED
+from errormotion.methods.beam_direction.identification.sensor import Sensor
 from errormotion.methods.beam_direction.planning import design
+from errormotion.methods.beam_direction.schema import SCHEMA
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
+    from errormotion.measurement.method import ModelMethod
     from errormotion.methods.beam_direction.planning.design import Design, Limits
     from errormotion.methods.beam_direction.settings import Settings
-    from errormotion.plugins import Method
 
 
 PUBLISHED = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
@@ -39,9 +44,10 @@ _UNCOMPENSATED = 0.03
 _NOTED_RATIO = 1.05
 """Ratio of the uncertainty to that by noise alone, from which on the latter is stated in a note."""
 SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
+_M, _1 = {"units": "m"}, {"units": "1"}
 
 
-def plan(method: Method, settings: Settings) -> xr.Dataset:
+def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
     """Return an error dataset of zeros with the expected covariance of the set-up in the settings.
 
     Additional variables over ``setup``: the larger expected uncertainty of the two angles of the beam,
@@ -53,7 +59,7 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
 
     Parameters
     ----------
-    method : Method
+    method : ModelMethod
     settings : Settings
 
     Raises
@@ -69,46 +75,76 @@ def plan(method: Method, settings: Settings) -> xr.Dataset:
     pair = design.optimise(limits, np.array(PUBLISHED))
     best = pair if number == 2 else design.optimise(limits, _angles(settings))
     setups = (design.equal_strokes(np.array(PUBLISHED), limits), stated, pair, best)
-    expected = [expected_direction(setup, settings, limits, remaining) for setup in setups]
-    totals = [readings + sources.T @ sources for readings, sources in expected]
-    angles = np.array([_larger_u(total, limits) for total in totals])
-    by_noise = np.array([_larger_u(readings, limits) for readings, _ in expected])
-    gain = float(angles[0] / angles[3])
-    beam, u = expected_with_origin(stated, settings, limits, remaining), limits.beam[None]
-    known = np.isfinite(beam.covariance[0, 0])
-    origin = np.array([settings.layout.nominal_origin if known else (np.nan,) * 3], np.float64)
-    total = beam.covariance + beam.influence.T @ beam.influence
-    errors, covariance = beam_errors(origin, u, origin, u, total[None])
-    influence = (np.nan_to_num(beam.influence) @ error_jacobian(u, u)[0].T)[:, None]
+    results = [solved_setup(setup, settings) for setup in setups]
+    angles = np.array([_larger_u(found.relative.errors.covariance[0], limits) for found in results])
+    by_noise = np.array([_larger_u(found.relative.errors.own[0], limits) for found in results])
     plane = ("best_plane",)
-    ds = build_errors(
-        errors,
-        covariance,
-        dims=("beam",),
-        coords={"beam": [settings.beam], "setup": list(SETUPS), "direction": list("xyz")},
-        component="beam",
-        machine="plan",
-        frame="machine",
-        functional_point=np.array(settings.layout.nominal_origin or (0.0, 0.0, 0.0)),
-        reference="planned, not measured",
-        method=method.info.id,
-        method_version=method.info.version,
-        provenance=provenance.make(settings, None, None, steps=["plan"])
-        | ({"calibration": remaining.calibration.reference()} if remaining is not None else {}),
-        influence=influence,
-        sources=["scale", "triangulation plane", *(f"inclination calibration {i + 1}" for i in range(number))],
-        source_groups=["sensor", "triangulation plane", *["inclination calibration"] * number],
-        extras={
-            "angle_uncertainty": xr.DataArray(angles, dims="setup", attrs={"units": "rad"}),
-            "readings_uncertainty": xr.DataArray(by_noise, dims="setup", attrs={"units": "rad"}),
-            "gain": xr.DataArray(gain, attrs={"units": "1"}),
-            "best_inclination": xr.DataArray(best.planes[:, 0], dims=plane, attrs={"units": "rad"}),
-            "best_rotation": xr.DataArray(best.planes[:, 1], dims=plane, attrs={"units": "rad"}),
-            "best_stroke": xr.DataArray(best.strokes, dims=(*plane, "direction"), attrs={"units": "m"}),
-            "best_readings": xr.DataArray(best.readings, dims=(*plane, "direction")),
-        },
-    )
-    return ds.assign_attrs(notes=_notes(setups, angles, by_noise, limits, remaining))
+    extras = {
+        "angle_uncertainty": xr.DataArray(angles, dims="setup", attrs={"units": "rad"}),
+        "readings_uncertainty": xr.DataArray(by_noise, dims="setup", attrs={"units": "rad"}),
+        "gain": xr.DataArray(float(angles[0] / angles[3]), attrs=_1),
+        "best_inclination": xr.DataArray(best.planes[:, 0], dims=plane, attrs={"units": "rad"}),
+        "best_rotation": xr.DataArray(best.planes[:, 1], dims=plane, attrs={"units": "rad"}),
+        "best_stroke": xr.DataArray(best.strokes, dims=(*plane, "direction"), attrs=_M),
+        "best_readings": xr.DataArray(best.readings, dims=(*plane, "direction")),
+    }
+    own = results[1]
+    coords = {"beam": [settings.beam], "setup": list(SETUPS), "direction": list("xyz")}
+    notes = _notes(setups, angles, by_noise, limits, remaining)
+    observed = replace(own.observed, extras=extras, coords=coords, notes=notes, doubts=())
+    origin = provenance.make(settings, None, None, steps=["plan"])
+    if remaining is not None:
+        origin |= {"calibration": remaining.sensor.calibration.reference()}
+    return dataset(method, replace(own, observed=observed), expected(settings), method.info, origin, planned=True)
+
+
+def solved_setup(setup: Design, settings: Settings) -> Solved:
+    """Return the solution of the readings that a set-up is expected to give.
+
+    Tilts that the calibration does not cover have its uncertainty there, which is large.
+    """
+    raw, anywhere = expected(settings, setup), settings.model_copy(update={"extrapolate": True})
+    observed = observe(raw, anywhere, Sensor.of(raw, anywhere))
+    return solve(as_expected(observed))
+
+
+def expected(settings: Settings, setup: Design | None = None) -> xr.Dataset:
+    """Return the readings, without noise, of a nominal beam on the planes of a set-up; by default of the settings.
+
+    With a compensation they have the inclination error of its calibration.
+    """
+    p, limits = settings.layout, design.limits_of(settings)
+    setup = stated_setup(settings, limits) if setup is None else setup
+    u, normals, middle = limits.beam, setup.normals, sum(p.reading_range) / 2
+    paths = setup.stages()
+    n = max(len(path) for path in paths)
+    path = np.stack([np.pad(each, ((0, n - len(each)), (0, 0)), constant_values=np.nan) for each in paths])
+    gradient = -normals / (normals @ u)[:, None]
+    distance = middle + np.einsum("kni,ki->kn", path, gradient)
+    variables = {
+        "nominal_direction": ("direction", u, _1),
+        "distance_noise": ((), p.noise / np.sqrt(p.average), _M),
+        "speckle": ((), p.speckle, _M),
+        "speckle_length": ((), p.speckle_length, _M),
+    }
+    if p.nominal_origin is not None:
+        variables["nominal_origin"] = ("direction", np.array(p.nominal_origin), _M)
+    if p.pivot is not None and p.nominal_origin is not None:
+        path = path + np.array(p.pivot) - np.array(p.nominal_origin) - middle * u
+        variables["plane_point"] = (("plane", "direction"), np.tile(p.pivot, (len(normals), 1)), _M)
+        variables["plane_point_uncertainty"] = ((), p.pivot_uncertainty, _M)
+    if p.triangulation_normal is not None:
+        normal = np.array(p.triangulation_normal)
+        variables["triangulation_normal"] = ("direction", normal / np.linalg.norm(normal), _1)
+    variables["distance"] = (("plane", "reading"), distance, _M)
+    variables["stage"] = (("plane", "reading", "direction"), path if settings.moves == "sensor" else -path, _M)
+    raw = xr.Dataset(variables, {"direction": list("xyz")}, {"schema": SCHEMA, "machine": "expected"})
+    sensor = Sensor.of(raw, settings)
+    if sensor is None:
+        return raw.assign(mid_range=((), middle, _M))
+    slope = sensor.calibration.slope(tilt(u, sensor.triangulation_normal, normals))[0]
+    m = sensor.mid_range
+    return raw.assign(distance=(("plane", "reading"), m + (distance - m) * (1 + slope)[:, None], _M))
 
 
 def stated_setup(settings: Settings, limits: Limits) -> Design:
@@ -126,93 +162,38 @@ def stated_setup(settings: Settings, limits: Limits) -> Design:
     return design.Design(planes, strokes, np.tile(counts, (len(planes), 1)), path)
 
 
-def expected_direction(
-    setup: Design, settings: Settings, limits: Limits, remaining: RemainingError | None
-) -> tuple[Array, Array]:
-    """Return the bound (3, 3) of the direction by its readings, and the influence of each source on it (source, 3).
-
-    The sources are the sensor's scale and its triangulation plane, common to all planes, and the remaining
-    inclination error at each plane, which is large if the calibration does not cover it.
-    """
-    p, u, stages = settings.layout, limits.beam, setup.stages()
-    noise = p.noise / np.sqrt(p.average)
-    readings = bound(stages, setup.normals, u, noise, p.speckle, p.speckle_length)
-    t = design.tilts(setup.normals, u)
-    variance = [u @ gradient_covariance(stage, noise, p.speckle, p.speckle_length) @ u for stage in stages]
-    # Sensitivity of the direction to the conditions of the planes, weighted by the noise only, as in `identify`.
-    sensitivity = readings @ across(u).T @ (t / np.array(variance)[:, None]).T
-    return readings, slopes_by_source(t, limits, remaining) @ sensitivity.T
-
-
-def slopes_by_source(t: Array, limits: Limits, remaining: RemainingError | None) -> Array:
-    """Return the influence of one standard uncertainty of each source on the slopes at tilts (k, 2): (source, k)."""
-    own, common = remaining.at(t) if remaining is not None else np.zeros((2, len(t)))
-    return np.concatenate([np.full((1, len(t)), limits.scale_uncertainty), common[None], np.diag(own)])
-
-
-def expected_with_origin(
-    setup: Design, settings: Settings, limits: Limits, remaining: RemainingError | None
-) -> Propagated:
-    """Return expected direction and zero point; the latter is NaN if nominal origin or pivot is not given."""
-    p, u, points = settings.layout, limits.beam, None
-    stages, origin = setup.stages(), None
-    if p.nominal_origin is not None and p.pivot is not None:
-        origin, points = np.array(p.nominal_origin), np.tile(np.array(p.pivot), (len(stages), 1))
-        middle = points[0] - origin - sum(p.reading_range) / 2 * u
-        stages = [middle + stage for stage in stages]
-    return expected_beam(
-        stages,
-        setup.normals,
-        u,
-        p.noise / np.sqrt(p.average),
-        p.speckle,
-        p.speckle_length,
-        origin=origin,
-        points=points,
-        point_uncertainty=p.pivot_uncertainty,
-        slope_by_source=slopes_by_source(design.tilts(setup.normals, u), limits, remaining),
-    )
-
-
 @dataclass(frozen=True)
 class RemainingError:
-    """Remaining inclination error after compensation with a calibration.
+    """Remaining inclination error after compensation with a calibration, for the search of the best planes.
 
     Attributes
     ----------
-    calibration : InclinationCalibration
-    beam, triangulation_normal : ndarray (3,)
-        Nominal unit vectors.
-    normal_uncertainty : float
-        Standard uncertainty of the triangulation plane's angle about the beam, rad.
+    sensor : Sensor
+    beam : ndarray (3,)
+        Nominal unit vector.
     extrapolate : bool
         Whether tilts that the calibration does not cover are allowed.
     """
 
-    calibration: InclinationCalibration
+    sensor: Sensor
     beam: Array
-    triangulation_normal: Array
-    normal_uncertainty: float
     extrapolate: bool
 
-    def at(self, t: Array) -> tuple[Array, Array]:
-        """Return the effects of calibration and triangulation plane on the slope at tilts (k, 2), (k,) each.
-
-        The latter is common to all planes. At tilts that the calibration does not cover, the remaining error is large.
-        """
-        q = self._tilt(t)
-        c, s = np.cos(self.normal_uncertainty), np.sin(self.normal_uncertainty)
-        plus, minus = (self.calibration.slope(q @ np.array([[c, sine], [-sine, c]]))[0] for sine in (s, -s))
-        return self.calibration.slope(q)[1], np.asarray(plus - minus) / 2
+    def at(self, t: Array) -> Array:
+        """Return the standard uncertainty (k,) of the slope at tilts (k, 2), with that of the triangulation plane."""
+        q, calibration, angle = self._tilt(t), self.sensor.calibration, self.sensor.normal_uncertainty
+        c, s = np.cos(angle), np.sin(angle)
+        plus, minus = (calibration.slope(q @ np.array([[c, sine], [-sine, c]]))[0] for sine in (s, -s))
+        return np.hypot(calibration.slope(q)[1], (plus - minus) / 2)
 
     def covers(self, t: Array) -> NDArray[np.bool_]:
         """Return whether the calibration can compensate a measurement at tilts (k, 2), (k,)."""
-        return np.asarray(self.extrapolate | self.calibration.supported(self._tilt(t)))
+        return np.asarray(self.extrapolate | self.sensor.calibration.supported(self._tilt(t)))
 
     def _tilt(self, t: Array) -> Array:
         normals = t @ across(self.beam) - self.beam
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return tilt(self.beam, self.triangulation_normal, normals)
+        return tilt(self.beam, self.sensor.triangulation_normal, normals)
 
     def table(self, max_inclination: float) -> Callable[[Array], Array]:
         """Return the uncertainty as a function of tilts (k, 2), interpolated in a table for speed.
@@ -223,7 +204,7 @@ class RemainingError:
         azimuth = np.linspace(-np.pi, np.pi, round(2 * np.pi / _TABLE_STEP) + 1)
         A, B = np.meshgrid(steep, azimuth, indexing="ij")
         t = np.stack([np.tan(A) * np.cos(B), np.tan(A) * np.sin(B)], axis=-1).reshape(-1, 2)
-        values = np.where(self.covers(t), np.hypot(*self.at(t)), _UNCOMPENSATED).reshape(A.shape)
+        values = np.where(self.covers(t), self.at(t), _UNCOMPENSATED).reshape(A.shape)
         per_step = np.array([(n - 1) / (x[-1] - x[0]) for x, n in ((steep, steep.size), (azimuth, azimuth.size))])
 
         def look_up(t: Array) -> Array:
@@ -235,20 +216,11 @@ class RemainingError:
 
 def _remaining(settings: Settings) -> RemainingError | None:
     """Return the remaining error with the calibration of the settings; None without calibration."""
-    if settings.compensation is None:
-        return None
-    p = settings.layout
-    if p.triangulation_normal is None:
+    if settings.compensation is not None and settings.layout.triangulation_normal is None:
         raise MethodError(f"layout.triangulation_normal: {NORMAL_NEEDED}")
-    u, t = np.array(p.nominal_direction, np.float64), with_receiver_right(p.triangulation_normal, settings.receiver)
-    calibration = InclinationCalibration.find(settings.compensation)
-    return RemainingError(
-        calibration,
-        u / np.linalg.norm(u),
-        t / np.linalg.norm(t),
-        settings.triangulation_normal_uncertainty,
-        settings.extrapolate,
-    )
+    raw = expected(settings)
+    sensor = Sensor.of(raw, settings)
+    return RemainingError(sensor, raw["nominal_direction"].values, settings.extrapolate) if sensor else None
 
 
 def _angles(settings: Settings) -> Array:
@@ -256,8 +228,12 @@ def _angles(settings: Settings) -> Array:
 
 
 def _larger_u(covariance: Array, limits: Limits) -> float:
+    """Return the larger uncertainty of the beam's two angles, rad, from the covariance (6, 6) of its errors.
+
+    A rotation about the beam itself is unknown, and none of the two.
+    """
     basis = across(limits.beam)
-    return design.worst_angle(basis @ covariance @ basis.T)
+    return design.worst_angle(basis @ np.nan_to_num(covariance[3:, 3:]) @ basis.T)
 
 
 def _notes(

@@ -17,7 +17,7 @@ from errormotion.methods.beam_direction.identification.check_bar.measure import 
 
 if TYPE_CHECKING:
     from errormotion.datasets.calibrations.inclination import InclinationCalibration
-    from errormotion.methods.beam_direction.identification.compensation import Sensor
+    from errormotion.methods.beam_direction.identification.sensor import Sensor
     from errormotion.methods.beam_direction.settings import Settings
 
 
