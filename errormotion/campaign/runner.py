@@ -387,7 +387,7 @@ class _Session:
         own = self._set_clock(folder, test)
         self._restore(folder)
         bench.set_limits(forbidden(self.campaign, test))
-        recorder = Recorder(folder.raw, dim, expected, attrs)
+        recorder = Recorder(folder.raw, dim, expected, attrs, method.also_append(test.settings))
         taken = before
         note = method.follow(test.settings) if self.progress.shown else None
         try:

@@ -109,6 +109,13 @@ class Method(Owner):
         """Return the dimension along which the yielded datasets are joined."""
         raise NotImplementedError
 
+    def also_append(self, settings: Any) -> Sequence[str]:  # noqa: ARG002
+        """Return further dimensions along which datasets are joined independently, such as that of index pulses.
+
+        No variable has two of them. A yielded dataset has all of its variables, without values where there are none.
+        """
+        return ()
+
     def progress(self, settings: Any) -> float:
         """Return the expected total for the progress bar: seconds for chunks with ``sample_rate``, else items."""
         raise NotImplementedError

@@ -122,6 +122,45 @@ def test_a_test_continues_in_the_middle_of_a_block(tmp_path: Path) -> None:
     same(path, chunk(0, 277))
 
 
+def with_pulses(first: int, n: int) -> xr.Dataset:
+    """Samples with a pulse and its temperature at every seventh; a dataset may have none."""
+    index = np.arange(first, first + n)
+    at = index[index % 7 == 0]
+    return chunk(first, n).assign(
+        pulse_time=("pulse", at / RATE, {"units": "s"}),
+        pulse_temperature=(("sensor", "pulse"), np.stack([at, -at]) / 3),
+    )
+
+
+@pytest.mark.parametrize("lengths", [[64], [1, 2, 3, 250], [100] * 7, [3, 3, 300, 1]])
+def test_two_dimensions_grow_independently(tmp_path: Path, lengths: list[int]) -> None:
+    path, first = tmp_path / "raw.zarr", 0
+    store = RawStore.create(path, with_pulses(0, lengths[0]), "time", 64 / RATE, ("pulse",))
+    for n in lengths:
+        store.append(with_pulses(first, n))
+        first += n
+        store.commit()
+        store = RawStore(path, "time", ("pulse",))
+        same(path, with_pulses(0, first))
+    assert store.count == committed_length(path, "time") == first
+    assert committed_length(path, "pulse") == -(-first // 7)
+
+
+def test_the_recorder_joins_both_dimensions(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "raw.zarr", "time", 1.0, {}, ("pulse",)) as recorder:
+        for first, n in ((0, 5), (5, 1), (6, 90)):
+            recorder.put(with_pulses(first, n))
+    same(tmp_path / "raw.zarr", with_pulses(0, 96))
+
+
+def test_a_variable_along_both_dimensions_is_refused(tmp_path: Path) -> None:
+    both = with_pulses(0, 14).assign(cross=(("time", "pulse"), np.zeros((14, 2))))
+    with pytest.raises(RunError, match="expected 'cross' along one of time, pulse"):
+        RawStore.create(tmp_path / "raw.zarr", both, "time", 1.0, ("pulse",))
+    with pytest.raises(RunError, match="expected data along 'pulse'"):
+        RawStore.create(tmp_path / "raw.zarr", chunk(0, 14), "time", 1.0, ("pulse",))
+
+
 def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     store.append(chunk(0, 10))

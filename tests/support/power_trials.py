@@ -30,18 +30,22 @@ from errormotion.record.runs.listing import list_runs
 
 RATE = 1000.0  # Hz
 LSB = 3.1e-8  # m
+PULSE = 17
+"""Samples from pulse to pulse."""
 
 Commit = Callable[[Any], None]
 
 
 def samples(first: int, n: int) -> xr.Dataset:
-    """Return samples of five channels, two temperatures and a text, all different."""
+    """Return samples of five channels, two temperatures and a text, all different, and pulses among them."""
     index = np.arange(first, first + n)
+    pulse = index[index % PULSE == 0]
     raw = xr.Dataset(
         {
             "distance": (("channel", "time"), (np.arange(5)[:, None] * 1000 + index % 60000) * LSB, {"units": "m"}),
             "temperature": (("time", "sensor"), np.column_stack([20 + index / 7, index / 3]), {"units": "degC"}),
             "state": ("time", np.array([f"state {k}" for k in index])),
+            "pulse_time": ("pulse", pulse / RATE, {"units": "s"}),
             "level": ("height", [0.01, 0.05]),
         },
         coords={"channel": ["X1", "X2", "Y1", "Y2", "Z"], "sensor": ["frame", "column"]},
@@ -66,7 +70,11 @@ def write_raw(folder: Path, commit: Commit) -> None:
     """Append to a store, close it, and continue it."""
     path, first = folder / "raw.zarr", 0
     for lengths in ([40, 40, 1, 60, 200], [30, 128, 5]):
-        store = RawStore.create(path, samples(0, 40), "time", 64 / RATE) if not first else RawStore(path, "time")
+        store = (
+            RawStore(path, "time", ("pulse",))
+            if first
+            else RawStore.create(path, samples(0, 40), "time", 64 / RATE, ("pulse",))
+        )
         for n in lengths:
             store.append(samples(first, n))
             first += n
@@ -87,7 +95,7 @@ def check_raw(folder: Path, committed: list[int]) -> list[str]:
         with datasets.load(path) as found:
             if faults := _expect(found, samples(0, kept)):
                 return faults
-    store = RawStore(path, "time")
+    store = RawStore(path, "time", ("pulse",))
     store.append(samples(kept, 100))
     getattr(store, "close", store.commit)()
     with datasets.load(path) as found:

@@ -33,16 +33,19 @@ class Fixed:
     path : Path
         The store.
     dim : str
-        The dimension that grows.
+        The dimension of the samples.
+    dims : tuple of str
+        All dimensions that grow.
     variables : mapping of str to Variable
     """
 
     path: Path
     dim: str
+    dims: tuple[str, ...]
     variables: Mapping[str, xr.Variable]
 
     @classmethod
-    def read(cls, path: Path, names: Iterable[str], dim: str) -> Self:
+    def read(cls, path: Path, names: Iterable[str], dim: str, dims: tuple[str, ...]) -> Self:
         """Read the variables of these names.
 
         Raises
@@ -53,7 +56,11 @@ class Fixed:
         dataset = open_zarr(path)
         if dataset is None:
             raise RunError(f"{path}: expected an array format that this version writes; found another one")
-        return cls(path, dim, {name: dataset.variables[name].load() for name in names})
+        return cls(path, dim, dims, {name: dataset.variables[name].load() for name in names})
+
+    @property
+    def _along(self) -> str:
+        return "along " + " or ".join(f"'{dim}'" for dim in self.dims)
 
     def check(self, chunk: xr.Dataset, growing: Mapping[str, Mapping[str, Any]], attrs: Mapping[str, Any]) -> None:
         """Refuse a dataset that differs from the first one in what is stored once, and would be lost.
@@ -73,19 +80,19 @@ class Fixed:
             Other variables, values or attributes.
         """
         stored = stored_variables(chunk, self.dim)
-        fixed = {name: variable for name, variable in stored.items() if self.dim not in variable.dims}
+        fixed = {name: variable for name, variable in stored.items() if not set(self.dims) & set(variable.dims)}
         if more := sorted({*fixed} ^ {*self.variables}):
             expected = ", ".join(sorted(self.variables)) or "none"
             what = "new" if more[0] in fixed else "missing"
             raise RunError(
-                f"{self.path}: expected the variables of the first dataset that do not grow along '{self.dim}' "
+                f"{self.path}: expected the variables of the first dataset that do not grow {self._along} "
                 f"({expected}); '{more[0]}' is {what}. {_REMEDY}"
             )
         for name, variable in fixed.items():
             before = self.variables[name]
             if variable.dims != before.dims or not _equal(variable.values, before.values):
                 raise RunError(
-                    f"{self.path}: '{name}' does not grow along '{self.dim}', and differs from the first dataset: "
+                    f"{self.path}: '{name}' does not grow {self._along}, and differs from the first dataset: "
                     f"expected {_described(before)}; found {_described(variable)}. {_REMEDY}"
                 )
         for name, variable in stored.items():

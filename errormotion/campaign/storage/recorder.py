@@ -7,6 +7,7 @@ import logging
 import queue
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
@@ -41,12 +42,17 @@ class Recorder:
         Expected total length; in seconds if the samples have a ``sample_rate``.
     attrs : dict
         Attributes of the store, unless the method sets them.
+    others : sequence of str
+        Further dimensions that grow.
     """
 
-    def __init__(self, path: Path, dim: str, expected: float, attrs: dict[str, Any]) -> None:
+    def __init__(
+        self, path: Path, dim: str, expected: float, attrs: dict[str, Any], others: Sequence[str] = ()
+    ) -> None:
         self._path, self._dim, self._expected, self._attrs = path, dim, expected, attrs
+        self._others = tuple(others)
         self._place = Presence(path.parent)
-        self._store = RawStore(path, dim) if path.exists() else None
+        self._store = RawStore(path, dim, self._others) if path.exists() else None
         self._clock = RecordClock(self.attrs, self.committed, self._end())
         self._queue: queue.Queue[xr.Dataset | None] = queue.Queue(maxsize=8)
         self._error: BaseException | None = None
@@ -116,7 +122,7 @@ class Recorder:
                 chunk = self._queue.get(timeout=limit)
                 if chunk is None:
                     break
-                if chunk.sizes.get(self._dim, 1):
+                if any(chunk.sizes.get(dim, 1) for dim in (self._dim, *self._others)):
                     self._append(chunk)
                     waiting_since = waiting_since or time.monotonic()
             except queue.Empty:
@@ -143,7 +149,7 @@ class Recorder:
         if self._store is None:
             first = chunk.assign_attrs({k: v for k, v in self._attrs.items() if k not in chunk.attrs})
             with self._place.held():
-                self._store = RawStore.create(self._path, first, self._dim, self._expected)
+                self._store = RawStore.create(self._path, first, self._dim, self._expected, self._others)
         self._store.append(chunk)
 
     def _raise(self) -> None:

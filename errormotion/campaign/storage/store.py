@@ -1,6 +1,7 @@
 """The raw store: a Zarr v3 folder that grows during a measurement and is complete at any time.
 
-Samples are written in blocks along one dimension. The order of writing keeps all committed samples if the process is
+Samples are written in blocks along one dimension, or several that grow independently, such as samples and index pulses;
+no variable has two of them. The order of writing keeps all committed samples if the process is
 killed, or the power fails, at any time. A commit
 
 1. writes the chunks with new samples. A chunk that already has committed samples is replaced by a rename, after its new
@@ -18,7 +19,8 @@ A commit rewrites the last, incomplete block of each array. A block is therefore
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -53,8 +55,24 @@ _KINDS = "biufU"
 """Kinds of the types that are stored: numbers, booleans and texts."""
 
 
+@dataclass
+class _Track:
+    """The arrays along one growing dimension: how much is appended, and how much a reader of the folder sees."""
+
+    dim: str
+    arrays: dict[str, Column]
+    block: int
+    count: int
+    committed: int
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the present block is not full and has samples that are not yet committed."""
+        return self.count % self.block > 0 and self.count > self.committed
+
+
 class RawStore:
-    """A raw store, to which datasets are appended along one dimension.
+    """A raw store, to which datasets are appended along one dimension or several.
 
     Parameters
     ----------
@@ -62,40 +80,53 @@ class RawStore:
         The ``.zarr`` folder.
     dim : str
         The dimension that grows.
-
-    Attributes
-    ----------
-    count : int
-        Samples appended, including those not yet committed.
-    committed : int
-        Samples visible to a reader of the folder.
+    others : sequence of str
+        Further ones; a dataset may have no values along them.
     """
 
-    def __init__(self, path: Path, dim: str) -> None:
+    def __init__(self, path: Path, dim: str, others: Sequence[str] = ()) -> None:
         self.path = path
         self.dim = dim
-        self.count = self.committed = committed_length(path, dim)
+        dims = (dim, *others)
         self._root = parse_json(read_bytes(path / "zarr.json", MAX_METADATA))
         self._static: dict[str, dict[str, Any]] = {}
-        self._arrays: dict[str, Column] = {}
+        arrays: dict[str, dict[str, Column]] = {each: {} for each in dims}
         for name, metadata in sorted(_array_metadata(path, self._root).items()):
-            if dim in dims_of(metadata):
-                self._arrays[name] = Column(path / name, metadata, dim)
+            along = _growing(name, dims_of(metadata), dims)
+            if along:
+                arrays[along][name] = Column(path / name, metadata, along)
             else:
                 self._static[name] = metadata
-        if not self._arrays:
-            raise RunError(f"{path}: expected at least one variable along '{dim}'; found none")
-        self.block = next(iter(self._arrays.values())).block
+        self._tracks: list[_Track] = []
+        for each, columns in arrays.items():
+            if not columns:
+                raise RunError(f"{path}: expected at least one variable along '{each}'; found none")
+            length = committed_length(path, each)
+            self._tracks.append(_Track(each, columns, next(iter(columns.values())).block, length, length))
+        self._arrays = {name: column for track in self._tracks for name, column in track.arrays.items()}
         self._presence = Presence(path)
         self._unsynced: set[Path] = set()
         _remove_parts(path)
         self._write_copies()
-        for column in self._arrays.values():
-            column.load(self.count)
-        self._fixed = Fixed.read(path, self._static, dim)
+        for track in self._tracks:
+            for column in track.arrays.values():
+                column.load(track.count)
+        self._fixed = Fixed.read(path, self._static, dim, dims)
+
+    @property
+    def count(self) -> int:
+        """Samples appended along ``dim``, including those not yet committed."""
+        return self._tracks[0].count
+
+    @property
+    def committed(self) -> int:
+        """Samples along ``dim`` visible to a reader of the folder."""
+        return self._tracks[0].committed
 
     @classmethod
-    def create(cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf) -> Self:
+    def create(
+        cls, path: Path, first: xr.Dataset, dim: str, expected: float = np.inf, others: Sequence[str] = ()
+    ) -> Self:
         """Create a store for datasets like this one, without samples.
 
         Parameters
@@ -110,21 +141,35 @@ class RawStore:
             The dimension that grows.
         expected : float
             Expected total length, from which the chunk size follows; in seconds if the samples have a ``sample_rate``.
+        others : sequence of str
+            Further dimensions that grow.
         """
         if not path.parent.is_dir():  # otherwise zarr would create it
             raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
-        if dim not in first.dims:
-            raise RunError(f"expected data along '{dim}'; the method yielded dims {', '.join(map(str, first.dims))}")
+        dims = (dim, *others)
+        for each in dims:
+            if each not in first.dims:
+                raise RunError(
+                    f"expected data along '{each}'; the method yielded dims {', '.join(map(str, first.dims))}"
+                )
         for name, variable in stored_variables(first, dim).items():
             if variable.dtype.kind not in _KINDS and not is_text(variable):
                 raise RunError(f"expected numbers or texts; '{name}' has the type {variable.dtype}")
-        growing = {
-            str(name): variable for name, variable in stored_variables(first, dim).items() if dim in variable.dims
-        }
+        stored = stored_variables(first, dim)
+        along = {name: each for name, variable in stored.items() if (each := _growing(name, variable.dims, dims))}
+        growing = {name: stored[name] for name in along}
         packings = {name: _packing(variable) for name, variable in growing.items()}
-        length = expected * float(first.attrs.get("sample_rate", 1.0))
-        block = _block_length(growing, packings, dim, length, float(first.attrs.get("sample_rate", 0.0)))
-        skeleton = first.isel({dim: slice(0, 0)}).drop_vars(
+        length, rate = (
+            (expected * float(first.attrs.get("sample_rate", 1.0))),
+            float(first.attrs.get("sample_rate", 0.0)),
+        )
+        blocks = {
+            each: _block_length(
+                {name: growing[name] for name, its in along.items() if its == each}, packings, each, length, rate
+            )
+            for each in dims
+        }
+        skeleton = first.isel({each: slice(0, 0) for each in dims}).drop_vars(
             [n for n in first.variables if n not in stored_variables(first, dim)]
         )
         skeleton = skeleton.drop_attrs(deep=False).assign_attrs(plain_attrs(first.attrs))
@@ -139,7 +184,7 @@ class RawStore:
         skeleton = skeleton.drop_indexes([name for name in coordinates if name in skeleton.xindexes])
         skeleton = skeleton.assign(texts).set_coords(coordinates).drop_encoding()
         for name, variable in growing.items():
-            chunks = tuple(block if d == dim else max(n, 1) for d, n in variable.sizes.items())
+            chunks = tuple(blocks[along[name]] if d == along[name] else max(n, 1) for d, n in variable.sizes.items())
             encoding[name] = {"chunks": chunks} | packings[name]
             if variable.dtype.kind in "fiub":
                 encoding[name]["compressors"] = [_codec(np.dtype(packings[name].get("dtype", variable.dtype)))]
@@ -148,7 +193,7 @@ class RawStore:
         with whole_folder(path) as part:
             # xarray's stub lacks zarr_format=3 with encodings per variable
             cast(Any, skeleton).to_zarr(part, mode="w", zarr_format=3, consolidated=False, encoding=encoding)
-        store = cls(path, dim)
+        store = cls(path, dim, others)
         store.commit()
         return store
 
@@ -165,26 +210,27 @@ class RawStore:
         """
         if self.dim not in chunk.dims:
             raise RunError(f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}")
-        length = chunk.sizes[self.dim]
+        dims = [track.dim for track in self._tracks]
         values = {name: self._encoded(name, variable) for name, variable in stored_variables(chunk, self.dim).items()
-                  if self.dim in variable.dims}  # fmt: skip
+                  if _growing(name, variable.dims, dims)}  # fmt: skip
         if set(values) != set(self._arrays):
             raise RunError(
-                f"{self.path}: expected the variables {', '.join(sorted(self._arrays))} along '{self.dim}'; "
-                f"the method yielded {', '.join(sorted(values))}"
+                f"{self.path}: expected the variables {', '.join(sorted(self._arrays))} along "
+                f"{' and '.join(repr(dim) for dim in dims)}; the method yielded {', '.join(sorted(values))}"
             )
         self._fixed.check(chunk, {name: column.attributes for name, column in self._arrays.items()}, self.attrs)
         self._check_continues(chunk)
-        taken = 0
-        while taken < length:
-            fill = self.count % self.block
-            take = min(self.block - fill, length - taken)
-            for name, column in self._arrays.items():
-                column.put(fill, values[name], taken, take)
-            self.count += take
-            taken += take
-            if self.count % self.block == 0:
-                self._write_block()
+        for track in self._tracks:
+            length, taken = chunk.sizes[track.dim], 0
+            while taken < length:
+                fill = track.count % track.block
+                take = min(track.block - fill, length - taken)
+                for name, column in track.arrays.items():
+                    column.put(fill, values[name], taken, take)
+                track.count += take
+                taken += take
+                if track.count % track.block == 0:
+                    self._write_block(track)
         self._add_counts(chunk.attrs)
 
     def commit(self) -> None:
@@ -207,8 +253,9 @@ class RawStore:
             self._write_copies()
 
     def _commit(self) -> None:
-        if self.count % self.block and self.count > self.committed:
-            self._write_block()
+        for track in self._tracks:
+            if track.waiting:
+                self._write_block(track)
         for path in sorted(self._unsynced, key=lambda path: path.is_dir()):  # files before the names of them
             sync(path)
         self._unsynced.clear()
@@ -219,28 +266,32 @@ class RawStore:
             "metadata": self._metadata(),
         }
         replace_text(self.path / "zarr.json", json.dumps(root))  # indented, it would take ten times as long
-        self.committed = self.count
+        for track in self._tracks:
+            track.committed = track.count
 
     @property
     def attrs(self) -> dict[str, Any]:
         """Attributes of the dataset; written with the next :meth:`commit`."""
         return cast(dict[str, Any], self._root["attributes"])
 
-    def _write_block(self) -> None:
-        """Write the current block of every array."""
+    def _write_block(self, track: _Track) -> None:
+        """Write the current block of every array along one dimension."""
         self._presence.check()
-        start = (self.count - 1) // self.block * self.block
-        contents = {column.file(start): column.content(self.count - start) for column in self._arrays.values()}
-        for name in self._arrays:
+        start = (track.count - 1) // track.block * track.block
+        contents = {column.file(start): column.content(track.count - start) for column in track.arrays.values()}
+        for name in track.arrays:
             self._unsynced |= _make_folders(self.path / name, contents)
         # Files without committed samples are flushed by the commit, all at once.
-        is_committed = start < self.committed
+        is_committed = start < track.committed
         replace_all(contents, flush=is_committed)
         if not is_committed:
             self._unsynced |= {*contents, *(file.parent for file in contents)}
 
     def _metadata(self) -> dict[str, Any]:
-        return self._static | {name: column.metadata(self.count) for name, column in self._arrays.items()}
+        growing = {
+            name: column.metadata(track.count) for track in self._tracks for name, column in track.arrays.items()
+        }
+        return self._static | growing
 
     def _write_copies(self) -> None:
         """Write the metadata of each array to its folder, unless they are there."""
@@ -259,8 +310,9 @@ class RawStore:
                 f"{self.path}: the method yielded the variable '{name}', which is missing in its first dataset"
             )
         column = self._arrays[name]
-        expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != self.dim}
-        found = {str(d): n for d, n in variable.sizes.items() if d != self.dim}
+        along = column.dims[column.axis]
+        expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != along}
+        found = {str(d): n for d, n in variable.sizes.items() if d != along}
         if found != expected:
             raise RunError(f"{self.path}: '{name}' has the sizes {found}; expected {expected}")
         if not (column.packing or fits(variable, column.dtype)):
@@ -304,6 +356,14 @@ class RawStore:
         for reason, count in _counts(attrs.get("invalid")).items():
             total[reason] = total.get(reason, 0) + count
         self.attrs["invalid"] = json.dumps(total)
+
+
+def _growing(name: str, of: Sequence[Hashable], dims: Sequence[str]) -> str:
+    """Return the growing dimension of a variable; empty if it has none."""
+    found = [dim for dim in dims if dim in of]
+    if len(found) > 1:
+        raise RunError(f"expected '{name}' along one of {', '.join(dims)}, which grow independently; found two")
+    return found[0] if found else ""
 
 
 def committed_length(path: Path, dim: str) -> int:
