@@ -66,7 +66,6 @@ def identify(folder: Path, *, plain: bool) -> dict[str, float]:
         "memory": memory,
         "result": found.nbytes / 2**20,
         "held": float(np.mean(held)),
-        "iterations": int(found["iterations"]),
     }
 
 
@@ -93,7 +92,7 @@ def main() -> None:
     if chosen.read:
         print(json.dumps(identify(Path(chosen.read), plain=chosen.plain)))
         return
-    print("targets    wall/s  processor/s  most memory/MiB  result/MiB  passes  within 95 %")
+    print("targets    wall/s  processor/s  most memory/MiB  result/MiB  within 95 %")
     for size in SIZES:
         if size > chosen.most:
             break
@@ -102,7 +101,7 @@ def main() -> None:
             answer = json.loads(_child("--read", folder, *(["--plain"] if chosen.plain else [])).splitlines()[-1])
         print(
             f"{answer['targets']:>7}  {answer['wall']:>8.2f}  {answer['processor']:>11.2f}  {answer['memory']:>15.0f}"
-            f"  {answer['result']:>10.0f}  {answer['iterations']:>6}  {100 * answer['held']:>10.1f}",
+            f"  {answer['result']:>10.0f}  {100 * answer['held']:>10.1f}",
             flush=True,
         )
 

@@ -177,8 +177,8 @@ class Volume:
 
     def points(self, position: Array, tool: Array) -> Array:
         """Return the commanded points of the tool in the workpiece frame, (m, 3), m."""
-        found: Array = self.machine.nominal_pose(position).apply(np.zeros(3)) + tool  # linear axes only
-        return found
+        directions = self.machine.nominal_pose(np.eye(position.shape[1])).apply(np.zeros(3))  # of linear axes
+        return np.asarray(position @ directions + tool)
 
 
 def first_order(motion: str) -> int:

@@ -22,13 +22,10 @@ from errormotion.methods.multilateration.network.model import Sources, Stations,
 from errormotion.methods.multilateration.network.network import Network
 from errormotion.methods.multilateration.network.start import initial_stations
 
-SAMPLE = 512
-"""Targets to which the stations are fitted first, if there are many."""
-_MIN_SAMPLES = 4  # numbers of targets, in samples, from which a sample is used
 DATUM_SAMPLE = 64
 """Number of evenly distributed targets whose datum is used to detect undetermined freedoms."""
 _TURNED = 1e-6
-"""Rotation of a solution into its datum that changes its derivatives noticeably, rad."""
+"""Rotation of a solution into its datum, rad, by which the directions of its uncertainties turn noticeably."""
 _GROSS_RMS = 100.0  # over the noise, from which gross outliers are searched first
 _MAX_SEARCHES = 12
 
@@ -140,13 +137,6 @@ class _Given:
     sources: Sources | None
     approximate: Array | None
 
-    def every(self, step: int) -> _Given:
-        """Return every ``step``-th target, without drift."""
-        part = slice(step // 2, None, step)
-        return replace(
-            self, reading=self.reading[:, part], sd=self.sd[:, part], nominal=self.nominal[part], sources=None
-        )
-
 
 def _checked(displacement: ArrayLike, target: ArrayLike, noise: ArrayLike) -> tuple[Array, Array, Array]:
     """Return copies of readings (n, m), their standard deviations (n, m), and targets; raise for wrong shapes."""
@@ -184,19 +174,7 @@ def _network(given: _Given, found: outliers.Outliers, at: Unknown | None = None)
     """Return the network without outliers."""
     used = np.where(found.out, np.nan, given.reading)
     determinacy.refuse_too_few(used)
-    if at is None and (step := used.shape[1] // SAMPLE) >= _MIN_SAMPLES:
-        at = _from_sample(given.every(step), used[:, step // 2 :: step], given)
     return _concluded(_in_datum(_problem(given, used), given, at), given, found)
-
-
-def _from_sample(sample: _Given, used: Array, given: _Given) -> Unknown | None:
-    """Return a start with the stations fitted to a sample of the targets, in its datum; None if that fails."""
-    try:
-        stations = _moved(_fitted(_problem(sample, used), sample, None), sample)[0].unknowns.station
-    except MethodError:
-        return None
-    start = _problem(given, given.reading).start
-    return replace(start, tables=[start.tables[0], stations, start.tables[2]])
 
 
 def _in_datum(problem: Problem, given: _Given, at: Unknown | None) -> Fit:
