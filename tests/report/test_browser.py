@@ -90,9 +90,10 @@ OVERFLOW = """addEventListener("load", () => {
 });"""
 
 
-def test_no_column_of_a_generic_report_is_cut_off(drift, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["spindle_drift", "other"])
+def test_no_column_of_a_table_is_cut_off(drift, tmp_path: Path, method: str) -> None:
     groups = ["uncertainty of the calibration of all five laser sensors", *drift["source_group"].values[1:]]
-    errors = drift.assign_attrs(method="other", component="C").assign_coords(source_group=("source", groups))
+    errors = drift.assign_attrs(method=method).assign_coords(source_group=("source", groups))
     page = write_report(errors, tmp_path / "page.html")
     html = page.read_text(encoding="utf-8")
     html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", html)  # for the script of the test

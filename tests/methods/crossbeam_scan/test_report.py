@@ -15,7 +15,7 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.report.figures import figures
 from errormotion.methods.crossbeam_scan.report.view import campaign
-from errormotion.report import canvas, write_report
+from errormotion.report import Form, canvas, write_report
 from errormotion.report.fields import remarks
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
@@ -439,6 +439,12 @@ def test_an_error_that_is_the_same_everywhere_is_drawn_without_a_warning(of_cons
 def test_artefacts_are_in_the_order_of_their_positions(undrawn):
     html = undrawn(campaign_dataset(minutes=(0, 30, 60), places=[0.3, -0.1, 0.1]))
     assert [row[0] for row in table(html, "The six errors in the last cycle")] == ["−100 mm", "100 mm", "300 mm"]
+
+
+def test_positions_and_times_have_no_trailing_zeros_in_german(small, tmp_path):
+    html = write_report(small, tmp_path / "report.html", form=Form(language="de")).read_text(encoding="utf-8")
+    rows = [row[0] for row in table(html, "Qualität jeder Registrierung")]
+    assert rows == ["30 min Warmlauf", "y = −700 mm", "y = −500 mm", "y = −300 mm", "60 min Warmlauf", *rows[5:]]
 
 
 def test_truth_of_the_machine_has_the_generic_chapter(undrawn):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -182,5 +183,5 @@ def after(seconds: float) -> str:
 
 
 def trimmed(number: str) -> str:
-    """Return a number without trailing zeros after its decimal point."""
-    return number.rstrip("0").rstrip(".") if "." in number else number
+    """Return a number without trailing zeros after its decimal sign."""
+    return number.rstrip("0").rstrip(".,") if re.search("[.,]", number) else number
