@@ -78,6 +78,27 @@ def test_intervals_of_variances_that_differ_contain_them() -> None:
     assert 0.9 <= held / (n * count) <= 0.98
 
 
+@pytest.mark.parametrize("ratio", [1.0, 5.0, 50.0])
+@pytest.mark.parametrize("freedom", [3.2, 9.0])
+def test_intervals_contain_equal_variances_and_one_that_is_larger(ratio: float, freedom: float) -> None:
+    """22 variances, of which one may be larger: 95 % of the intervals of the others contain them, most of its own do.
+
+    One that is five times as large may as well be one of the others by chance, and is shifted towards them.
+    """
+    rng, n, count = np.random.default_rng(8), 22, 200
+    others, largest = 0, 0
+    true = np.ones(n)
+    true[5] = ratio
+    for _ in range(count):
+        drawn = draw_variances(true * rng.chisquare(freedom, n) / freedom, freedom, TRIALS, rng, common=False)
+        low, high = np.quantile(drawn, (0.025, 0.975), axis=0)
+        inside = (low <= true) & (true <= high)
+        largest += int(inside[5])
+        others += int(inside.sum()) - int(inside[5])
+    assert 0.94 <= others / (count * (n - 1)) <= 0.99
+    assert largest >= stats.binom.ppf(1e-3, count, 0.8 if ratio == 5.0 else 0.92)
+
+
 def test_components_are_drawn_if_they_are_significant() -> None:
     rng = np.random.default_rng(6)
     drawn = draw_components(np.array([9.0, 0.01]), np.array([1.0, 1.0]), 9.0, TRIALS, rng)

@@ -9,7 +9,7 @@ Figures that are extreme values of a curve are too large on average if the curve
   assumes that the remainders at all positions are alike: they are not if a curve is flat in one part and has a step in
   another one.
 * A variance that is estimated with v degrees of freedom has a scaled inverse chi-square distribution. Variances that
-  differ from position to position are treated like a curve, by their logarithms.
+  differ from position to position are treated like a curve without a line, by their logarithms.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from scipy import special
 
 from errormotion.arrays import Array
 
+LIMIT = 0.5
+"""Largest shift of the logarithm of a variance towards the mean, in standard deviations of its estimate."""
 SIGNIFICANT = 0.01
 """Probability below which a component of variance is significantly different from 0."""
 
@@ -81,20 +83,28 @@ def draw_variances(
         Degrees of freedom of each estimate; infinite if it is exact.
     common : bool
         Whether the estimates are one, repeated; otherwise each has its own degrees of freedom, and their logarithms are
-        shrunk towards the mean by the share of their variance that is not the variance of estimation.
+        shrunk towards the mean by the share of their variance that is not the variance of estimation, but by `LIMIT`
+        standard deviations at most (Efron, Morris, J. Am. Stat. Assoc. 67 (1972) 130): one that differs from all others
+        is not like them. Variance and mean of the logarithms are drawn as well.
     """
     if common:
         scale = freedom / generator.chisquare(freedom, trials) if np.isfinite(freedom) else np.ones(trials)
         return np.asarray(scale.reshape(-1, *(1,) * estimate.ndim) * estimate)
     known = np.isfinite(estimate)
-    # E ln(chi2_v / v) = digamma(v / 2) - ln(v / 2), Var = trigamma(v / 2)
-    logs = np.log(estimate[known]) - special.digamma(freedom / 2.0) + np.log(freedom / 2.0)
-    noise = float(special.polygamma(1, freedom / 2.0))
-    centre, width = logs.mean(), logs.var(ddof=1)
-    B = max(0.0, 1.0 - noise / width) if width > 0 else 0.0
+    # ln(estimate / variance) = ln(chi2_v / v) has E = digamma(v / 2) - ln(v / 2), Var = trigamma(v / 2)
+    excess = special.digamma(freedom / 2.0) - np.log(freedom / 2.0)
+    logs = np.log(estimate[known]) - excess
+    noise, n = float(special.polygamma(1, freedom / 2.0)), logs.size
+    # the variance of the logarithms, and their mean, are drawn as well
+    off = logs - logs.mean()
+    width = float(off @ off) / generator.chisquare(max(n - 1, 1), (trials, 1))
+    centre = logs.mean() + np.sqrt(width / n) * generator.standard_normal((trials, 1))
+    limit = LIMIT * np.sqrt(noise)
+    share = _true_share(width, np.asarray(noise)) if n > 1 else 1.0
+    B = np.maximum(share, 1.0 - limit / np.maximum(np.abs(off), limit))
     drawn = np.full((trials, *estimate.shape), np.nan)
-    shrunk = centre + B * (logs - centre)
-    drawn[:, known] = np.exp(shrunk + np.sqrt(B * noise) * generator.standard_normal((trials, logs.size)))
+    error = np.log(generator.chisquare(freedom, (trials, logs.size)) / freedom) - excess
+    drawn[:, known] = np.exp(centre + B * (logs - centre) - np.sqrt(B) * error)
     return drawn
 
 

@@ -8,8 +8,9 @@ from scipy import stats
 
 from errormotion.measurement.identification import solve
 from errormotion.methods.linear_positioning import Settings
-from errormotion.methods.linear_positioning.identification import standard
+from errormotion.methods.linear_positioning.identification import extremes, standard
 from errormotion.methods.linear_positioning.identification.identify import evaluate, figures_of, observe
+from errormotion.methods.linear_positioning.identification.scatter import scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, Statistics
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
@@ -55,3 +56,20 @@ def test_the_excess_of_extreme_values_is_estimated():
     k = FIGURES.index("R_forward")
     assert error[:, k].mean() > 0.4e-6
     assert abs((error - bias)[:, k].mean()) < error[:, k].mean()
+
+
+@pytest.mark.parametrize("runs", [5, 10])
+def test_the_repeatability_of_an_axis_with_one_bad_target_is_within_its_uncertainty(runs):
+    """One of eleven targets scatters seven times as much as the others, which determines R."""
+    z, seeds, held = np.linspace(-1.0, 1.0, 11), 60, 0
+    sd = 1e-6 * np.where(np.arange(11) == 4, 3.0, 0.4)
+    for seed in range(seeds):
+        draw = np.random.default_rng(seed).normal
+        x = 3e-6 * z**2 + 0.3e-6 * draw(size=(1, runs, 1)) + sd * draw(size=(2, runs, 11))
+        found = scatter(x, z, kind="auto", drift=None, stated=None)
+        of = extremes.figures(x, z, found, np.zeros((0, 11)), 0.0, straight=False, trials=300)
+        true = np.tile(np.hypot(sd, 0.3e-6), (2, 1))
+        k = FIGURES.index("R_forward")
+        R = standard.figures(Statistics(np.tile(3e-6 * z**2, (2, 1)), true))[k]
+        held += abs(of.value[k] - of.bias[k] - R) <= 2.0 * of.u[k]
+    assert held >= stats.binom.ppf(1e-3, seeds, 0.9)  # 53 and 75 % if the largest is drawn as one of the others
