@@ -107,32 +107,16 @@ class SpindleDrift(ModelMethod):
         return LiveDrift(settings).update
 
     def identify(self, raw: xr.Dataset, settings: DriftSettings | None = None) -> xr.Dataset:
-        """Turn a raw dataset into an error dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
+        """Return the error dataset of a raw dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
 
-        Parameters
-        ----------
-        raw : Dataset
-            Schema ``errormotion.raw.spindle_drift/1``, either variant; not modified; it may be larger than memory.
-        settings : Settings, optional
-
-        Raises
-        ------
-        DatasetError
-            The raw dataset violates its schema; all violations are reported together.
-        MethodError
-            The data do not determine the result.
+        The raw dataset is not modified, and may be larger than memory. Errors as for `ModelMethod.identify`.
         """
+        if "sphere_radius" not in raw:
+            return super().identify(raw, settings)
         from errormotion.datasets.validation import checked_raw
+        from errormotion.methods.spindle_drift.identification.detection import identify_beams
 
-        settings = settings or DriftSettings()
-        checked = checked_raw(raw, self)
-        if "sphere_radius" in raw:
-            from errormotion.methods.spindle_drift.identification.detection import identify_beams
-
-            return identify_beams(checked, settings, self.info.id, self.info.version)
-        from errormotion.measurement.identification import identify
-
-        return identify(self, checked, settings, self.info)
+        return identify_beams(checked_raw(raw, self), settings or DriftSettings(), self.info.id, self.info.version)
 
     def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
         """Return what a drift record means; see ``model``."""

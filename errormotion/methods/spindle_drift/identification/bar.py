@@ -27,14 +27,57 @@ _SINGULAR = 1e-12
 """Determinant of the derivatives below which the beams do not determine the axis."""
 
 
-def _fit(distance: Array, origin: Array, direction: Array, radius: float, z1: float, z2: float, start: Array) -> Array:
-    """Return the axes (instant, 4) by Newton's method from ``start``, all instants at the same time."""
+def fit_axis(distance: Array, origin: Array, direction: Array, radius: float, levels: Array) -> Array:
+    """Fit the axis of a cylinder of known radius to the four side readings of every instant.
+
+    Parameters
+    ----------
+    distance : ndarray (>= 4, instant)
+        Readings of X1, X2, Y1, Y2 in this order, m; further rows are ignored.
+    origin : ndarray (>= 4, 3) or (instant, >= 4, 3)
+        Zero points of the beams, m.
+    direction : ndarray (>= 4, 3)
+        Their unit vectors.
+    radius : float
+        Bar radius, m.
+    levels : ndarray (2,)
+        Heights L1, L2 at which the axis is given, m.
+
+    Returns
+    -------
+    ndarray (instant, 4)
+        x and y of the axis at L1, then at L2, m; NaN where a reading is NaN or no cylinder fits.
+    """
+    u = direction[:SIDE]
+    surface = origin[..., :SIDE, :] + u * distance[:SIDE].T[:, :, None]  # (instant, beam, 3)
+    found = np.full((len(surface), 4), np.nan)
+    instant = np.flatnonzero(np.isfinite(surface).all(axis=(1, 2)))
+    start = _start(surface[instant[0]], u, radius, levels) if instant.size else found[:0]
+    if np.isfinite(start).all() and instant.size:
+        found[instant] = _newton(surface[instant], radius, float(levels[0]), float(levels[1]), start)
+    return found
+
+
+def _start(point: Array, direction: Array, radius: float, levels: Array) -> Array:
+    """Return a starting axis (4,) from points (4, 3), as if every side beam pointed to the middle of the bar.
+
+    Each side beam i gives one equation for the axis at its height: in its horizontal direction the axis is one radius
+    behind the surface point. The four equations are linear in q. Singular (parallel) beams give NaN.
+    """
+    flat = direction * [1.0, 1.0, 0.0]
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    tau = (point[:, 2:] - levels[0]) / (levels[1] - levels[0])
+    rows = np.concatenate([(1 - tau) * flat[:, :2], tau * flat[:, :2]], axis=1)
+    if not np.linalg.cond(rows) < 1e8:
+        return np.full(4, np.nan)
+    return np.linalg.solve(rows, np.sum(flat * point, axis=1) + radius)
+
+
+def _newton(surface: Array, radius: float, z1: float, z2: float, start: Array) -> Array:
+    """Return the axes (instant, 4) of points (instant, 4, 3) by Newton's method, all instants at the same time."""
     height = z2 - z1
-    found = np.full((distance.shape[1], 4), np.nan)
-    instant = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
-    q = np.tile(start, (instant.size, 1))
-    at = np.broadcast_to(origin, (distance.shape[1], *origin.shape[-2:]))[instant, :SIDE]
-    surface = at + direction[:SIDE] * distance[:SIDE, instant].T[:, :, None]  # (instant, beam, 3)
+    found = np.full((len(surface), 4), np.nan)
+    instant, q = np.arange(len(surface)), np.tile(start, (len(surface), 1))
     for _ in range(MAX_STEPS):
         slope = (q[:, 2:] - q[:, :2]) / height
         w = surface - np.concatenate([q[:, :2], np.full((len(q), 1), z1)], axis=1)[:, None]
@@ -57,83 +100,17 @@ def _fit(distance: Array, origin: Array, direction: Array, radius: float, z1: fl
     return found
 
 
-def start_axis(origin: Array, direction: Array, distance: Array, radius: float, levels: Array) -> Array:
-    """Return a starting axis (4,) from one set of readings, as if every side beam pointed to the middle of the bar.
-
-    Each side beam i gives one equation for the axis at its height: in its horizontal direction the axis is one radius
-    behind the surface point. The four equations are linear in q. Singular (parallel) beams give NaN.
-    """
-    point = origin[:SIDE] + direction[:SIDE] * distance[:SIDE, None]
-    flat = direction[:SIDE].copy()
-    flat[:, 2] = 0.0
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    tau = (point[:, 2] - levels[0]) / (levels[1] - levels[0])
-    rows = np.column_stack([(1 - tau) * flat[:, 0], (1 - tau) * flat[:, 1], tau * flat[:, 0], tau * flat[:, 1]])
-    if not np.linalg.cond(rows) < 1e8:
-        return np.full(4, np.nan)
-    return np.linalg.solve(rows, np.sum(flat * point, axis=1) + radius)
-
-
-def fit_axis(
-    distance: Array, origin: Array, direction: Array, radius: float, levels: Array, start: Array | None = None
-) -> Array:
-    """Fit the axis of a cylinder of known radius to the four side readings of every instant.
-
-    Parameters
-    ----------
-    distance : ndarray (>= 4, instant)
-        Readings of X1, X2, Y1, Y2 in this order, m; further rows are ignored.
-    origin : ndarray (>= 4, 3) or (instant, >= 4, 3)
-        Zero points of the beams, m.
-    direction : ndarray (>= 4, 3)
-        Their unit vectors.
-    radius : float
-        Bar radius, m.
-    levels : ndarray (2,)
-        Heights L1, L2 at which the axis is given, m.
-    start : ndarray (4,), optional
-        Start of Newton's method; default from the first instant without NaN.
-
-    Returns
-    -------
-    ndarray (instant, 4)
-        x and y of the axis at L1, then at L2, m; NaN where a reading is NaN or no cylinder fits.
-    """
-    unknown = np.full((distance.shape[1], 4), np.nan)
-    if start is None:
-        known = np.flatnonzero(np.isfinite(distance[:SIDE]).all(axis=0))
-        if known.size == 0:
-            return unknown
-        first = origin if origin.ndim == 2 else origin[known[0]]
-        start = start_axis(first, direction, distance[:, known[0]], radius, levels)
-    if not np.isfinite(start).all():
-        return unknown
-    return _fit(distance, origin, direction, radius, float(levels[0]), float(levels[1]), start)
-
-
-def end_point(q: Array, distance_z: Array, origin: Array, direction: Array, levels: Array) -> tuple[Array, Array]:
-    """Return axis directions (instant, 3) and the points E where the axis meets the end face (instant, 3), m.
-
-    ``origin`` (3,) or (instant, 3) and ``direction`` (3,) are those of the Z beam, ``distance_z`` (instant,) its
-    readings.
-    """
-    A = np.column_stack([q[:, 0], q[:, 1], np.full(len(q), levels[0])])
-    B = np.column_stack([q[:, 2], q[:, 3], np.full(len(q), levels[1])])
-    a = (B - A) * np.sign(levels[1] - levels[0])
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    S = origin + direction * distance_z[:, None]
-    along = np.einsum("ti,ti->t", a, S - A)
-    return a, A + a * along[:, None]
-
-
 def states(distance: Array, origin: Array, direction: Array, radius: float, levels: Array) -> Array:
     """Return the states of the bar, (instant, 5): E, m, and the slopes a_x / a_z, a_y / a_z; arguments of `fit_axis`.
 
     NaN where one of the five readings is NaN, or where no cylinder fits.
     """
-    q = fit_axis(np.where(np.isfinite(distance).all(axis=0), distance, np.nan), origin, direction, radius, levels)
-    a, E = end_point(q, distance[4], origin[..., 4, :], direction[4], levels)
-    return np.column_stack([E, a[:, :2] / a[:, 2:]])
+    q = fit_axis(distance, origin, direction, radius, levels)
+    A = np.column_stack([q[:, :2], np.full(len(q), levels[0])])
+    slope = (q[:, 2:] - q[:, :2]) / (levels[1] - levels[0])
+    a = np.column_stack([slope, np.ones(len(q))]) / np.sqrt(1.0 + np.sum(slope**2, axis=1, keepdims=True))
+    S = origin[..., 4, :] + direction[4] * distance[4, :, None]
+    return np.column_stack([A + a * np.sum(a * (S - A), axis=1, keepdims=True), slope])
 
 
 def axis_direction(state: Array) -> list[Array]:
