@@ -7,6 +7,7 @@ instrument an error of scale, a beam that is not parallel to the axis, and therm
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,6 @@ from errormotion.methods.linear_positioning.diagonals.simulation import expected
 from errormotion.methods.linear_positioning.identification.expansion import SIDES
 from errormotion.methods.linear_positioning.planning.targets import positions
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
-from errormotion.methods.linear_positioning.virtual import MACHINE, instruments_of
 from errormotion.methods.linear_positioning.warming import expected_moving
 from errormotion.twin import VirtualMachine, truth
 
@@ -31,6 +31,8 @@ SCATTER, DRIFT = 0.5e-6, 1.0e-6
 """Defaults of the standard deviation of a reading and of the range by drift during a run, m or rad."""
 EXPANSION, EXCESS_TEMPERATURE = 11.5e-6, 2.0
 """Coefficient of expansion of the axis, 1/K, and its temperature above 20 degC, K."""
+MACHINE = "gantry"
+"""Kind of the virtual machine."""
 _M = {"units": "m"}
 
 
@@ -119,7 +121,9 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
         machine_expansion=((), EXPANSION, {"units": "1/K"}),
         machine_expansion_uncertainty=((), 0.6e-6, {"units": "1/K"}),
     )
-    attrs = {"machine": machine.name, "instruments": instruments_of(machine)}
+    address = f"twin://{machine.kind}?seed={machine.seed}"
+    instrument = {"id": "virtual interferometer", "address": address, "simulated": True}
+    attrs = {"machine": machine.name, "instruments": json.dumps([instrument])}
     return raw.assign_attrs(attrs), _truth(machine, settings, P, true)
 
 

@@ -9,7 +9,7 @@ from scipy import stats
 from errormotion.measurement.identification import solve
 from errormotion.methods.linear_positioning import Settings
 from errormotion.methods.linear_positioning.identification import extremes, standard
-from errormotion.methods.linear_positioning.identification.identify import evaluate, figures_of, observe
+from errormotion.methods.linear_positioning.identification.identify import evaluate, observe, statistics_of
 from errormotion.methods.linear_positioning.identification.scatter import scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, Statistics
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
@@ -36,7 +36,7 @@ def compared(name):
     for seed in range(SEEDS):
         raw, truth = raw_and_truth(SETTINGS, seed, BEHAVIOURS[name])
         seen = evaluate(raw, SETTINGS)
-        (of,) = figures_of(seen, solve(observe(raw, seen, SETTINGS)), SETTINGS.trials)
+        (of,), _ = statistics_of(seen, solve(observe(raw, seen, SETTINGS)), SETTINGS, ("freedom", "position"), {})
         found.append((of.value - true_figures(truth, BEHAVIOURS[name]), of.bias, of.u))
     return np.array(found).transpose(1, 0, 2)
 

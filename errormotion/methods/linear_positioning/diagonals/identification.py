@@ -6,7 +6,7 @@ same for all diagonals; errors of alignment and drift are independent.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -15,8 +15,8 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.measurement import Observed, Places
 from errormotion.methods.linear_positioning.diagonals.lines import squareness_of
-from errormotion.methods.linear_positioning.identification import model, standard
-from errormotion.methods.linear_positioning.identification.identify import Evaluated, figures_of
+from errormotion.methods.linear_positioning.identification import model
+from errormotion.methods.linear_positioning.identification.identify import Evaluated, statistics_of
 from errormotion.methods.linear_positioning.identification.reading import (
     MIN_TARGETS,
     Readings,
@@ -184,20 +184,4 @@ def squareness(observed: Observed, relative: Relative) -> dict[str, xr.DataArray
 
 def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:
     """Return the statistics of the standard at each stop, and the figures."""
-    figures = figures_of(evaluated, solved, settings.trials)
-    statistics = standard.statistics(evaluated.readings.x)
-    figure_dims, mean_dims = ("diagonal", "figure"), ("diagonal", "approach", "target")
-    found: dict[str, tuple[Any, Any, str]] = {
-        "figure_value": (figure_dims, [each.value for each in figures], "ISO 230-6"),
-        "figure_bias": (figure_dims, [each.bias for each in figures], "excess of figure_value by scatter"),
-        "figure_u": (figure_dims, [each.u for each in figures], "of figure_value less figure_bias"),
-        "deviations": (("diagonal", "approach", "run", "target"), evaluated.readings.x, "readings"),
-        "unidirectional_mean": (mean_dims, statistics.mean, ""),
-        "unidirectional_s": (mean_dims, statistics.s, ""),
-    }
-    return {
-        name: xr.DataArray(
-            np.asarray(values, dtype=float), dims=dims, attrs=_METRE | ({"long_name": text} if text else {})
-        )
-        for name, (dims, values, text) in found.items()
-    }
+    return statistics_of(evaluated, solved, settings, DIMS, _METRE)[1]

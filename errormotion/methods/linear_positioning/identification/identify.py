@@ -14,7 +14,7 @@ from errormotion.estimation.extremes import Extremes
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.measurement import Datum, Observed, Places
 from errormotion.methods.linear_positioning.identification import extremes, model, standard
-from errormotion.methods.linear_positioning.identification.reading import Readings, point_of, read, zero_of
+from errormotion.methods.linear_positioning.identification.reading import LENGTHS, Readings, point_of, read, zero_of
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.schema import APPROACHES
@@ -80,6 +80,7 @@ def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observ
         datum=_ends(position, known, readings.straight) if readings.straight.any() else None,
         recorded=("deviation", ("run", "approach", "target", "freedom")),
         freedoms=[by_name[name] for name in names],
+        unit="m" if set(map(by_name.get, names)) & set(LENGTHS) else "rad",
         dims=("position",),
         coords={
             "xyz"[direction_of(axis)]: ("position", position, {"units": "m"}),
@@ -113,11 +114,6 @@ def _ends(position: Array, known: Array, straight: Any) -> Datum:
 # ---------------------------------------------------------------------- figures and statistics
 
 
-def figures_of(evaluated: Evaluated, solved: Solved, trials: int) -> list[Extremes]:
-    """Return the figures of each line, of an axis or of diagonals, with bias and uncertainty."""
-    return [_figures(evaluated, solved, k, trials) for k in range(len(evaluated.spreads))]
-
-
 def _figures(evaluated: Evaluated, solved: Solved, k: int, trials: int, *, aligned: bool = False) -> Extremes:
     """Return the figures of line ``k``; with ``aligned`` those corrected for the mean of a stated cosine error."""
     readings = evaluated.readings
@@ -142,34 +138,52 @@ def _figures(evaluated: Evaluated, solved: Solved, k: int, trials: int, *, align
     )
 
 
-def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:
-    """Return the statistics of the standard at each target, the figures, and the corrected readings."""
-    readings = evaluated.readings
-    statistics = standard.statistics(readings.corrected)
-    figures = figures_of(evaluated, solved, settings.trials)
-    dims = ("freedom", "approach", "position")
-    found: dict[str, tuple[Any, Any, str]] = {
-        "deviations": (("freedom", "approach", "run", "position"), readings.corrected, "readings, corrected; m, rad"),
-        "unidirectional_mean": (dims, statistics.mean, "mean unidirectional deviation; m, rad"),
-        "unidirectional_s": (dims, statistics.s, "estimator of the unidirectional standard deviation; m, rad"),
-        "reversal": (("freedom", "position"), statistics.reversal, "mean forward minus mean backward; m, rad"),
-        "reversal_u": (("freedom", "position"), reversal_u(evaluated), "standard uncertainty of reversal; m, rad"),
-        "figure_value": (("freedom", "figure"), [each.value for each in figures], "ISO 230-2; m, rad"),
+def statistics_of(
+    evaluated: Evaluated, solved: Solved, settings: Settings, dims: tuple[str, str], attrs: dict[str, str]
+) -> tuple[list[Extremes], dict[str, xr.DataArray]]:
+    """Return the figures of each line, and with them the statistics of the standard and the corrected readings.
+
+    ``dims`` are those of lines and targets in the result; ``attrs`` those of all variables.
+    """
+    line, target = dims
+    x = evaluated.readings.corrected
+    statistics = standard.statistics(x)
+    figures = [_figures(evaluated, solved, k, settings.trials) for k in range(len(evaluated.spreads))]
+    found: dict[str, tuple[tuple[str, ...], Any, str]] = {
+        "deviations": ((line, "approach", "run", target), x, "readings, corrected"),
+        "unidirectional_mean": ((line, "approach", target), statistics.mean, "mean unidirectional deviation"),
+        "unidirectional_s": (
+            (line, "approach", target),
+            statistics.s,
+            "estimator of the unidirectional standard deviation",
+        ),
+        "figure_value": ((line, "figure"), [each.value for each in figures], "as the standard defines it"),
         "figure_bias": (
-            ("freedom", "figure"),
+            (line, "figure"),
             [each.bias for each in figures],
-            "mean excess of figure_value over the true figure, by scatter; m, rad",
+            "mean excess of figure_value over the true figure, by scatter",
         ),
         "figure_u": (
-            ("freedom", "figure"),
+            (line, "figure"),
             [each.u for each in figures],
-            "standard uncertainty of figure_value less figure_bias; m, rad",
+            "standard uncertainty of figure_value less figure_bias",
         ),
     }
-    arrays = {
-        name: xr.DataArray(np.asarray(values), dims=dims, attrs={"long_name": meaning})
-        for name, (dims, values, meaning) in found.items()
+    return figures, {
+        name: xr.DataArray(np.asarray(values), dims=its, attrs={"long_name": meaning, **attrs})
+        for name, (its, values, meaning) in found.items()
     }
+
+
+def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:
+    """Return statistics and figures of an axis, its reversal, and the figures of the positioning by name."""
+    readings, dims = evaluated.readings, ("freedom", "position")
+    attrs = {"comment": "m, rad"}
+    figures, arrays = statistics_of(evaluated, solved, settings, dims, attrs)
+    reversal = {"reversal": standard.statistics(readings.corrected).reversal, "reversal_u": reversal_u(evaluated)}
+    meanings = ("mean forward minus mean backward", "standard uncertainty of reversal")
+    for (name, values), meaning in zip(reversal.items(), meanings, strict=True):
+        arrays[name] = xr.DataArray(values, dims=dims, attrs={"long_name": meaning, **attrs})
     for k in np.flatnonzero([name[1] == name[2] for name in readings.names]):  # the positioning
         of_axis = figures[k]
         for i, name in enumerate(FIGURES):
