@@ -240,9 +240,12 @@ CARRIED = ("chain", "operator", "certificates", "straightness_reference")
 
 
 def variants(schema: str) -> tuple[RawSchema, ...]:
-    """Return the raw schemas of one id, from the plugin that provides them; none for an unknown id."""
+    """Return the raw schemas of one id, or of a former one, from the plugin that provides them; none if unknown."""
     owner = plugins.owner_of_schema(schema)
-    return () if owner is None else tuple(table for table in owner.raw_schemas if table.id == schema)
+    if owner is None:
+        return ()
+    now = plugins.present_schema(schema, owner)
+    return tuple(table for table in owner.raw_schemas if table.id == now)
 
 
 def raw_schemas() -> tuple[RawSchema, ...]:

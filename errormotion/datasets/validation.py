@@ -85,8 +85,9 @@ def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
         It has the schema of another method.
     """
     schema = method.needs.raw_schema
-    checked = raw if "schema" in raw.attrs else raw.assign_attrs(schema=schema)
-    validate(checked, tuple(method.raw_schemas))
-    if checked.attrs["schema"] != schema:
-        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {checked.attrs['schema']}.")
-    return checked
+    found = raw.attrs.get("schema", schema)
+    now = plugins.present_schema(str(found), method)
+    validate(raw.assign_attrs(schema=now), tuple(method.raw_schemas))
+    if now != schema:
+        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {found}.")
+    return raw.assign_attrs(schema=found)

@@ -45,12 +45,16 @@ class Datum:
         Of its uncertainty in the budget.
     names : sequence of str, (g,)
         Of the coefficients.
+    beside : ndarray, (place, d, b), optional
+        Columns that are adapted at the same time and stay in the errors, such as the radius of a circle of whose centre
+        the errors are independent.
     """
 
     columns: Array
     weight: Array
     group: str
     names: Sequence[str] = ()
+    beside: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +87,11 @@ def relative(errors: Errors, datum: Datum) -> Relative:
     """
     A, known = datum.columns, np.isfinite(errors.value)
     w = np.where(known, np.broadcast_to(datum.weight, errors.value.shape), 0.0)
-    N = np.einsum("pdg,pd,pdh->gh", A, w, A)
+    every = A if datum.beside is None else np.concatenate([A, datum.beside], axis=2)
+    N = np.einsum("pdg,pd,pdh->gh", every, w, every)
     if np.linalg.matrix_rank(N, hermitian=True) < len(N):
         raise FitError("the known values do not determine the datum; measure more of the places that define it")
-    H = np.einsum("gh,pdh,pd->pgd", np.linalg.inv(N), A, w)  # (place, g, d)
+    H = np.einsum("gh,pdh,pd->pgd", np.linalg.inv(N)[: A.shape[2]], every, w)  # (place, g, d)
     value = np.where(known, errors.value, 0.0)
     h = np.einsum("pgd,pd->g", H, value)
     F = np.nan_to_num(errors.influence)

@@ -42,6 +42,7 @@ from errormotion.plugins.registry import (
     loaded,
     owner_of_method,
     owner_of_schema,
+    present_schema,
     refresh,
 )
 from errormotion.plugins.subjects import CompensatorSubject, InstrumentSubject, MethodSubject
@@ -91,6 +92,7 @@ __all__ = [
     "loaded",
     "owner_of_method",
     "owner_of_schema",
+    "present_schema",
     "refresh",
     "replaced",
     "states",

@@ -50,13 +50,18 @@ class InstrumentInfo:
 
 @dataclass(frozen=True)
 class MethodInfo:
-    """Description of a method; ``cannot_see`` lists what it does not determine."""
+    """Description of a method; ``cannot_see`` lists what it does not determine.
+
+    ``former`` are ids that the method once had. Where no plugin has such an id, campaigns and commands that state it,
+    results with it and raw data ``errormotion.raw.FORMER/1`` belong to this method, with a warning.
+    """
 
     id: str
     summary: str
     status: Status
     version: str = "1"
     cannot_see: tuple[str, ...] = ()
+    former: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from errormotion.plugins.contracts import DatasetInfo, InstrumentInfo, MethodInf
 
 Group = Literal["instruments", "methods", "datasets", "compensators"]
 GROUPS: tuple[Group, ...] = ("instruments", "methods", "datasets", "compensators")
+RAW = "errormotion.raw."
+"""Start of the raw schemas."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def _rivals(group: Group, plugin_id: str) -> str:
 
 
 def get(group: Group, plugin_id: str) -> Any:
-    """Return the class of a plugin.
+    """Return the class of a plugin; that of a method also by a former id, with a warning.
 
     Raises
     ------
@@ -158,6 +160,8 @@ def get(group: Group, plugin_id: str) -> Any:
     points = [point for point in _found()[group] if point.name == plugin_id]
     what = group.rstrip("s")
     if not points:
+        if group == "methods" and (renamed := _renamed(plugin_id)) is not None:
+            return renamed
         names = sorted({point.name for point in _found()[group]})
         near = get_close_matches(plugin_id, names, n=1)
         hint = f" Did you mean '{near[0]}'?" if near else ""
@@ -207,19 +211,35 @@ def _warn(message: str) -> None:
 def owner_of_schema(schema: str) -> Any:
     """Return the plugin class whose datasets have this schema; None if there is none.
 
-    For a schema ``errormotion.raw.NAME/1``, the plugin NAME is tried first.
+    For a schema ``errormotion.raw.NAME/1``, the plugin NAME is tried first, and last a method with the former id NAME.
     """
     name = schema.removeprefix("errormotion.").removeprefix("raw.").partition("/")[0]
     for cls in _named_first(name, ("methods", "datasets")):
         if schema in _schemas_of(cls):
             return cls
-    return None
+    renamed = _renamed(name)
+    return renamed if renamed is not None and present_schema(schema, renamed) in _schemas_of(renamed) else None
+
+
+def present_schema(schema: str, cls: Any) -> str:
+    """Return the raw schema of a plugin class for one that has a former id of it; any other schema unchanged."""
+    name, _, number = schema.removeprefix(RAW).partition("/")
+    return f"{RAW}{cls.info.id}/{number}" if name in getattr(cls.info, "former", ()) else schema
 
 
 def owner_of_method(method: str) -> Any:
     """Return the plugin class whose error datasets have this attribute ``method``; None if there is none."""
     for cls in _named_first(method, ("methods", "datasets")):
         if method == cls.info.id or (issubclass(cls, DatasetPlugin) and method in cls.info.methods):
+            return cls
+    return _renamed(method)
+
+
+def _renamed(name: str) -> Any:
+    """Return the method that once had this id, with a warning; None if there is none."""
+    for cls in loaded("methods"):
+        if name in cls.info.former:
+            _warn(f"The method '{name}' is called '{cls.info.id}' now. Write '{cls.info.id}' in its place.")
             return cls
     return None
 

@@ -223,6 +223,24 @@ def test_the_coefficients_of_a_datum_share_the_sources_of_the_errors(n: int) -> 
         assert whole(result.errors) == pytest.approx(M @ whole(before) @ M.T, abs=1e-12)
 
 
+@pytest.mark.parametrize("n", [90, 400])
+def test_a_column_beside_the_datum_is_adapted_and_stays(n: int) -> None:
+    """The centre of an incomplete circle is that of the circle of the best radius, and the radius remains."""
+    rng = np.random.default_rng(12)
+    angle = np.linspace(0.3, 6.0, n)
+    own = np.square(rng.uniform(0.5, 2.0, n))[:, None, None]
+    before = Errors(5.0 + rng.standard_normal((n, 1)), own, [Source("length", "length", np.ones((n, 1)))])
+    A, B = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.ones((n, 1))
+    datum = Datum(A[:, None, :], np.ones((n, 1)), "centre", ("x", "y"), beside=B[:, None, :])
+    result = relative(before, datum)
+    H = np.linalg.pinv(np.hstack([A, B]))[:2]
+    M = np.eye(n) - A @ H
+    assert result.coefficient == pytest.approx(H @ before.value[:, 0])
+    assert result.errors.value[:, 0] == pytest.approx(M @ before.value[:, 0])
+    assert result.errors.covariance[:, 0, 0] == pytest.approx(np.diag(M @ whole(before) @ M.T), rel=1e-9)
+    assert result.errors.sources[0].effect == pytest.approx(np.ones((n, 1)))
+
+
 def test_a_source_that_the_datum_removes_has_no_effect() -> None:
     n = 30
     A = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)

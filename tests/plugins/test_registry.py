@@ -3,10 +3,12 @@
 import sys
 
 import pytest
+import xarray as xr
 
 from errormotion import plugins
 from errormotion.datasets import schemas
-from errormotion.errors import PluginError, PluginWarning
+from errormotion.datasets.validation import checked_raw
+from errormotion.errors import DatasetError, PluginError, PluginWarning
 
 GOOD = """
 from errormotion.plugins import InstrumentInfo, PluginSettings
@@ -204,3 +206,67 @@ def test_parts_that_the_base_class_only_declares_are_required(install):
         plugins.get("methods", "old")
     with pytest.raises(AttributeError, match="plugins have no part 'motion'"):
         plugins.states(plugins.Method, "motion")
+
+
+RENAMED = """
+import xarray as xr
+from errormotion.datasets.schemas import RawSchema, Row
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings
+
+class Renamed(Method):
+    info = MethodInfo("new_drift", "A method that was called old_drift", "simulated_only", former=("old_drift",))
+    needs = Needs((), "errormotion.raw.new_drift/1")
+    Settings = PluginSettings
+    raw_schemas = (
+        RawSchema("errormotion.raw.new_drift/1", "", "reading", (Row("reading", ("time",), "m", 0.0, 1.0, "it"),)),
+    )
+    def acquire(self, bench, settings, *, inputs, done=None): ...
+    def append_dim(self, settings): return "time"
+    def progress(self, settings): return 1.0
+    def identify(self, raw, settings): return raw
+    def plan(self, settings): return settings
+"""
+
+
+@pytest.fixture
+def renamed(install):
+    """Install a method with a former name."""
+    install("renamed", "[errormotion.methods]\nnew_drift = renamed:Renamed\n", RENAMED)
+    return r"The method 'old_drift' is called 'new_drift' now\."
+
+
+@pytest.mark.parametrize(
+    ("door", "name"),
+    [
+        (lambda name: plugins.get("methods", name), "old_drift"),
+        (plugins.owner_of_method, "old_drift"),
+        (plugins.owner_of_schema, "errormotion.raw.old_drift/1"),
+    ],
+    ids=["get", "owner_of_method", "owner_of_schema"],
+)
+def test_a_former_name_of_a_method_finds_it_with_a_warning(renamed, door, name):
+    with pytest.warns(PluginWarning, match=renamed):
+        found = door(name)
+    assert found.info.id == "new_drift"
+
+
+def test_the_raw_data_of_a_former_name_follow_the_present_tables(renamed):
+    old = "errormotion.raw.old_drift/1"
+    with pytest.warns(PluginWarning, match=renamed):
+        assert [table.id for table in schemas.variants(old)] == ["errormotion.raw.new_drift/1"]
+    raw = xr.Dataset({"reading": ("time", [0.5], {"units": "m"})}, attrs={"schema": old})
+    assert checked_raw(raw, plugins.get("methods", "new_drift")()).attrs["schema"] == old
+    with pytest.raises(DatasetError, match=r"reading = 5 m: expected 0\.\.1 m"):
+        checked_raw((raw * 10).assign_attrs(raw.attrs), plugins.get("methods", "new_drift")())
+    assert schemas.variants("errormotion.raw.old_drift/2") == ()
+
+
+def test_a_plugin_precedes_the_former_name_of_another_one(renamed, install):
+    source = RENAMED.replace("new_drift", "old_drift").replace(', former=("old_drift",)', "")
+    install("kept", "[errormotion.methods]\nold_drift = kept:Renamed\n", source)
+    for found in (
+        plugins.get("methods", "old_drift"),
+        plugins.owner_of_method("old_drift"),
+        plugins.owner_of_schema("errormotion.raw.old_drift/1"),
+    ):
+        assert found.info.id == "old_drift"
