@@ -42,8 +42,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     Parameters
     ----------
     settings : Settings
-        Layout, repeatability and scale uncertainty are used; the last one is the standard deviation of a scale error,
-        0 if not stated.
+        Layout, repeatability, and what is uncertain besides: each source of the equation is drawn once.
     seed : int
         Of the machine and of the measurement.
 
@@ -52,20 +51,33 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     BenchError
         Targets out of the travel of the machine.
     """
+    from errormotion.methods.multilateration.identification.expansion import along_beams, expected_sources
+    from errormotion.methods.multilateration.network.model import directions
     from errormotion.methods.multilateration.planning.layout import grid
 
     machine, layout = VirtualMachine("cframe", seed=seed), settings.layout
     position = grid(layout)[0]
+    target, station = position + np.array(layout.reflector), np.array(layout.stations)
+    sources, rng = expected_sources(settings, position, target), np.random.default_rng([seed, 3])
+    scale = sum(u * rng.normal() for u in (*sources.air.values(), *sources.tracker.values()))
+    change = np.zeros((len(station), len(target))) + sum(rng.normal() * each.change for each in sources.scales)
     measured = raw(
         machine,
         position,
-        layout.stations,
+        station,
         seed=seed,
         reflector=layout.reflector,
         noise=layout.displacement_noise,
         repeatability=settings.repeatability or 0.0,
-        scale=(settings.scale_uncertainty or 0.0) * np.random.default_rng([seed, 3]).normal(),
+        scale=scale,
     )
+    if (e := settings.expansion) is not None:
+        warm = e.reference if e.temperature is None else e.temperature
+        strain = np.full((len(station), 3), e.coefficient * (warm - e.reference))
+        change = change + along_beams(strain, position - position.mean(axis=0), directions(target, station))
+        measured["scale_temperature"] = (("station", "direction"), np.full(strain.shape, warm), {"units": "degC"})
+    measured["displacement"] = measured["displacement"] + change
+    measured["displacement"].attrs.update(_M)
     return measured, true_errors(machine, position, layout.reflector)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from errormotion import datasets
 from errormotion.errors import BenchError
@@ -73,3 +74,26 @@ def test_the_layout_of_the_settings_is_simulated_with_its_true_errors():
     for name in ("EX", "EY", "EZ"):
         u = np.sqrt(errors["covariance"].sel(dof=name, dof_=name).values)
         assert np.abs(errors[name].values - truth[name].values).max() < 5 * u.max()
+
+
+def test_simulated_data_contain_all_sources_that_the_result_states():
+    """The size of the volume along X: 40 independent draws of expansion, air and tracker, far above the noise."""
+    settings = Settings(
+        scale_uncertainty=3e-6,
+        air={"temperature_uncertainty": 2.0},
+        expansion={"coefficient": 11.5e-6, "temperature": 24.0, "temperature_uncertainty": 0.5},
+        parametric=False,
+    )
+    square, groups = [], {}
+    for seed in range(40):
+        raw, truth = Multilateration().simulate(settings, seed)
+        found = Multilateration().identify(raw, settings)
+        x = found["x"].values - found["x"].values.mean()
+        F = found["influence"].values[..., 0]
+        own = found["covariance"].values[:, 0, 0] - (F**2).sum(axis=0)
+        off = x @ (found["EX"].values - truth["EX"].values)
+        square.append(off**2 / (np.sum((F @ x) ** 2) + x**2 @ own))
+        for group, effect in zip(found["source_group"].values, np.abs(F @ x), strict=True):
+            groups[group] = max(groups.get(group, 0.0), effect)
+    assert min(groups[name] for name in ("refraction", "scale of the tracker", "scales")) > groups["stations"]
+    assert 1e-3 < chi2.cdf(np.sum(square), 40) < 1 - 1e-3

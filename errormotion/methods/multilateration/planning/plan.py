@@ -12,10 +12,9 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.expansion import LABORATORY, causes, expansion_sources
+from errormotion.methods.multilateration.identification.expansion import expected_sources
 from errormotion.methods.multilateration.identification.uncertainty import Scatter, parts
 from errormotion.methods.multilateration.names import station_names, target_names
-from errormotion.methods.multilateration.network.model import Shared, Sources, directions
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.methods.multilateration.planning.sight import Sight
@@ -67,7 +66,7 @@ def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None)
     own = np.array(p.stations, np.float64)
     noise = reading_noise(settings)
     sees = sight.sees(own, target)
-    expected = bound(target, own, noise=noise, seen=sees, sources=_sources_of(settings, position, target))
+    expected = bound(target, own, noise=noise, seen=sees, sources=expected_sources(settings, position, target))
     sigma = layout.uncertainty(expected.target_covariance)
     if planning.targets is None:
         found = _best_stations(settings, planning, sight, own, expected)
@@ -207,20 +206,6 @@ def _write(path: Path, text: str) -> None:
         raise MethodError(
             f"planning.write: {path}: the file cannot be created: {error.strerror or error}. State another name."
         ) from error
-
-
-def _sources_of(settings: Settings, position: Array, target: Array) -> Sources:
-    """Return what will be uncertain besides the noise, by the equations of the identification.
-
-    Without a stated temperature of the scales, the one that will be measured is taken as the reference.
-    """
-    air = causes(*LABORATORY, settings.air.wavelength, settings.air)
-    scales: list[Shared] = []
-    if (e := settings.expansion) is not None:
-        station = np.array(settings.layout.stations, np.float64)
-        warmer = 0.0 if e.temperature is None else e.temperature - e.reference
-        scales = expansion_sources(np.full((len(station), 3), warmer), position, directions(target, station), e)
-    return Sources(air, {"tracker scale": settings.scale_or_assumed}, scales)
 
 
 def _notes(
