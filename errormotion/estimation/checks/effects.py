@@ -19,11 +19,12 @@ from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
 from errormotion.estimation.fit import Fit
 
-__all__ = ["MIN_REDUNDANCY", "At", "Numbers", "information", "reduced", "solved", "swept"]
+__all__ = ["MIN_REDUNDANCY", "SINGULAR", "At", "Numbers", "information", "reduced", "solved", "swept"]
 
 MIN_REDUNDANCY = 1e-3
 """Redundancy of a number below which an error would not be seen."""
-_SINGULAR = 1e-9
+SINGULAR = 1e-9
+"""Smallest eigenvalue of information, relative to the largest one, that is not regarded as rounding."""
 
 At = tuple[int, int]
 """Reading and number; 0 for a whole reading."""
@@ -130,7 +131,7 @@ def solved(u: Array, N: Array, floor: float | Array = 0.0) -> tuple[Array, Array
         Less information counts as none.
     """
     values, vectors = np.linalg.eigh(N)
-    least = np.maximum(_SINGULAR * values[..., -1], np.maximum(floor, 1e-300))
+    least = np.maximum(SINGULAR * values[..., -1], np.maximum(floor, 1e-300))
     kept = values > least[..., None]
     along = np.einsum("...ij,...i->...j", vectors, u)
     inside = np.where(kept, along / np.where(kept, values, 1.0), 0.0)
@@ -140,7 +141,7 @@ def solved(u: Array, N: Array, floor: float | Array = 0.0) -> tuple[Array, Array
 def swept(u: Array, N: Array, part: slice) -> tuple[Array, Array]:
     """Return u and N of all effects after the effect ``part`` is estimated as well."""
     values, vectors = np.linalg.eigh(N[part, part])
-    kept = values > _SINGULAR * max(float(values[-1]), 1e-300)
+    kept = values > SINGULAR * max(float(values[-1]), 1e-300)
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     gone = N[:, part] @ inverse
     return u - gone @ u[part], N - gone @ N[part]

@@ -26,7 +26,7 @@ from errormotion.errors import FitError
 from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Index
 from errormotion.estimation.checks.candidates import Candidate
-from errormotion.estimation.checks.effects import MIN_REDUNDANCY, At, Numbers, reduced, solved, swept
+from errormotion.estimation.checks.effects import MIN_REDUNDANCY, SINGULAR, At, Numbers, reduced, solved, swept
 from errormotion.estimation.checks.probability import log_chi2_tail, log_f_tail
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
@@ -435,12 +435,34 @@ class _Sequence:
             noise = noise.without(gain, self.k)
         chosen = [j for j, _ in self.order[:last]]
         while chosen:
-            found = [self._given(j, [i for i in chosen if i != j]) for j in chosen]
-            worst = max(range(len(chosen)), key=lambda i: found[i].chance)
-            if found[worst].chance < self.limit:
+            chances = self._chances(chosen)
+            worst = int(np.argmax(chances))
+            if chances[worst] < self.limit:
+                found = [self._given(j, [i for i in chosen if i != j]) for j in chosen]
                 return sorted(found, key=lambda each: -each.gain)
             del chosen[worst]
         return []
+
+    def _chances(self, chosen: list[int]) -> Array:
+        """Return the logarithms of the probabilities of numbers, each given that the others are excluded.
+
+        With ``a = N^-1 u`` of all of them and its covariance ``C = N^-1``, what the others leave of one is
+        ``N' = C_jj^-1`` and ``u' = N' a_j``; the gain of the others is that of all without its own.
+        """
+        k = self.k
+        at = (np.array(chosen)[:, None] * k + np.arange(k)).ravel()
+        u, N = self.u[at], self.N[np.ix_(at, at)]
+        values, vectors = np.linalg.eigh(N)
+        if values[0] <= SINGULAR * values[-1]:
+            return np.array([self._given(j, [i for i in chosen if i != j]).chance for j in chosen])
+        C = (vectors / values) @ vectors.T
+        a = C @ u
+        each = np.arange(len(chosen))
+        own = np.linalg.inv(C.reshape(len(chosen), k, len(chosen), k)[each, :, each])
+        left = (own @ a.reshape(-1, k, 1))[..., 0]
+        gains = solved(left, own, self.floor[chosen])[1]
+        others = [self.noise.without(float(u @ a - gain), k * (len(chosen) - 1)) for gain in gains]
+        return np.array([noise.chance(float(gain), k) for noise, gain in zip(others, gains, strict=True)])
 
     def _as_stated(self, of_structure: float) -> bool:
         """Return whether the readings without the sequence, or without one outlier or change, scatter as stated.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 from scipy import special
 
 from errormotion.errors import FitError, MethodError
@@ -19,8 +20,9 @@ from errormotion.methods.normal_vector.identification.freedoms import Motion, un
 from errormotion.methods.normal_vector.identification.reading import AXES
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from errormotion.estimation.checks.exclusions import Cleaned
-    from errormotion.estimation.problem import Problem
     from errormotion.measurement.identification import Solved
     from errormotion.methods.normal_vector.model import Probing
 
@@ -65,8 +67,11 @@ def agreeing_axes(solved: Solved, probing: Probing, smallest_move: float) -> lis
     """
     if solved.cleaned is None:
         return []
-    stated, problem = solved.given.noise.stated, solved.given
-    if stated and agrees(solved.cleaned, probing):
+    if solved.given.noise.stated and agrees(solved.cleaned, probing):
+        return []
+    try:
+        own = _Whole(probing)
+    except FitError:
         return []
     anchor = solved.fit.constants.centre if probing.data.seen.touched else solved.fit.unknowns.reach
     found: list[tuple[float, str]] = []
@@ -75,7 +80,7 @@ def agreeing_axes(solved: Solved, probing: Probing, smallest_move: float) -> lis
         if axes == probing.motion.tool_axes or undetermined(anchor, other.motion):
             continue
         try:
-            gain, further = _gain(probing, other, problem)
+            gain, further = _gain(own, _Whole(other))
             if gain <= ODDS + (special.chdtri(further, FALSE_ALARM) if further else 0.0):
                 continue
             if agrees(other.cleaned(smallest_move), other):
@@ -94,18 +99,30 @@ def agrees(cleaned: Cleaned, probing: Probing) -> bool:
     )
 
 
-def _gain(probing: Probing, other: Probing, problem: Problem) -> tuple[float, int]:
+class _Whole:
+    """The fit of all readings with some axes of the tool."""
+
+    def __init__(self, probing: Probing) -> None:
+        self.probing = probing
+        self.fit = probing.fitted(probing.problem())
+        self.usable = probing.usable(self.fit.problem)
+
+    def chi2(self, cycles: NDArray[np.bool_]) -> float:
+        """Return the sum of squares of the readings in some cycles (k,)."""
+        some = self.fit if np.array_equal(cycles, self.usable) else self.probing.fitted(self.probing.problem(), cycles)
+        return some.chi2
+
+
+def _gain(own: _Whole, other: _Whole) -> tuple[float, int]:
     """Return the decrease of chi-square by other axes, and the number of their further unknowns.
 
     Both explain the cycles that determine the motion with either. Without a stated noise its variance is that of all
     touches with the other axes.
     """
-    whole = other.fitted(other.problem())
-    variance = 1.0 if problem.noise.stated else whole.chi2 / max(whole.freedom, 1)
-    both = probing.usable(problem) & other.usable(whole.problem)
-    own, its = (each.fitted(each.problem(), both) for each in (probing, other))
-    further = max(len(other.motion.seen) - len(probing.motion.seen), 0) * int(both.sum())
-    return (own.chi2 - its.chi2) / variance, further
+    variance = 1.0 if other.fit.problem.noise.stated else other.fit.chi2 / max(other.fit.freedom, 1)
+    both = own.usable & other.usable
+    further = max(len(other.probing.motion.seen) - len(own.probing.motion.seen), 0) * int(both.sum())
+    return (own.chi2(both) - other.chi2(both)) / variance, further
 
 
 def _scatter_as_stated(found: Fit) -> bool:

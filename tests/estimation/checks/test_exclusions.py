@@ -13,7 +13,7 @@ from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
 from errormotion.estimation.checks.candidates import Candidate, steps
 from errormotion.estimation.checks.effects import Numbers, information, solved
-from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, doubts, notes
+from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, _Sequence, cleaned, doubts, notes
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -251,6 +251,27 @@ def test_the_instant_of_a_step_is_the_best_of_all(monkeypatch: pytest.MonkeyPatc
                 for each in (one, other)
             ]
             assert gains[0] > 0.99 * gains[1]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("stated", [False, True])
+def test_the_chances_of_several_numbers_are_those_of_each_given_the_others(whole: bool, stated: bool) -> None:
+    """At once by one inverse, and one after the other; also all numbers, without which nothing is determined."""
+    rng = np.random.default_rng(22)
+    y = rng.standard_normal((30, 3))
+    y[[3, 7, 11, 20]] += 10.0
+    problem = vectors(y, np.tile(np.eye(3) + 0.3, (30, 1, 1)))
+    found = fit(replace(problem, noise=replace(problem.noise, stated=stated)))
+    sequence = _Sequence(found, Numbers(found, whole), 0.0, np.log(1e-5))
+    chosen = [j for j, _ in sequence.order]
+    assert len(chosen) > 3
+    each = [sequence._given(j, [i for i in chosen if i != j]).chance for j in chosen]
+    assert sequence._chances(chosen) == pytest.approx(each, rel=1e-6)
+    every = list(range(len(sequence.where)))
+    if not whole:
+        assert sequence._chances(every) == pytest.approx(
+            [sequence._given(j, [i for i in every if i != j]).chance for j in every], rel=1e-6
+        )
 
 
 def test_a_single_outlier_is_not_a_move() -> None:
