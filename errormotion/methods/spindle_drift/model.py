@@ -1,8 +1,9 @@
 """The measurement model of a drift: five readings of a bar at each instant, and all that makes them uncertain.
 
 The state of the bar is the end E of its axis and the direction a of the axis, 5 numbers. A beam with origin P and
-direction u hits it at S = P + p k (theta - theta0) + u (d + o): p is the displacement of the origin with the
-temperature theta of the measuring frame, k a factor for its uncertainty, d the reading and o the run-out at rest. With
+direction u hits it at S = P + p k (theta - theta0) + u (g d + o): p is the displacement of the origin with the
+temperature theta of the measuring frame, k a factor for its uncertainty, d the reading of a sensor with the gain g, and
+o the run-out at rest. With
 t = a . (S - E), the part of S - E across the axis q = S - E - a t, and the radius R of the bar,
 
     |q| - R = 0    X1, X2, Y1, Y2           t = 0    Z
@@ -51,7 +52,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 UNSEEN = "rotation about the spindle axis"
 """Group of the rotation that no reading sees; without effect on the axis."""
-CERTIFIED = {"bar radius": ("bar", "radius"), "frame expansion": ("frame", "coefficient of expansion")}
+CERTIFIED = {
+    "bar radius": ("bar", "radius"),
+    "frame expansion": ("frame", "coefficient of expansion"),
+    **{f"gain {name}": ("sensor", f"gain {name}") for name in CHANNELS},
+}
 """Sources that are one draw in all measurements with one certificate."""
 _UNSEEN_KNOTS = 8
 _LEAST_NOISE = 1e-4
@@ -74,6 +79,7 @@ class Known(NamedTuple, Generic[T]):
 
     beam: T
     radius: T
+    gain: T
     run_out: T
     expansion: T
     warming: T
@@ -117,7 +123,7 @@ class Seen:
         reference[-1] = state[-1]
         state[-1] = 0.0
         readings = np.zeros((*t.shape, y.shape[1]))
-        readings[:, range(5), range(5)] = self._along(n, c)
+        readings[:, range(5), range(5)] = self._along(n, c) * c.gain
         if y.shape[1] > 5:
             readings[:-1, :, 5] = (self._warmed(n) * c.expansion)[:-1]
         return {"state": state, "reference": reference, "readings": readings}
@@ -132,8 +138,9 @@ class Seen:
             beam[:, range(5), range(5), 3 + k] = n[k] * d
         radius = np.full((*t.shape, 1), -1.0)
         radius[:, 4] = 0.0
-        run_out = np.zeros((*t.shape, 5))
+        gain, run_out = np.zeros((*t.shape, 5)), np.zeros((*t.shape, 5))
         run_out[:, range(5), range(5)] = self._along(n, c)
+        gain[:, range(5), range(5)] = self._along(n, c) * self._read(y)
         warmed = self._warmed(n)
         expansion = (warmed * self._warming(y, c))[..., None]
         warming = (warmed * c.expansion)[..., None]
@@ -141,11 +148,18 @@ class Seen:
         return {
             "beam": beam,
             "radius": radius,
+            "gain": gain,
             "run_out": run_out,
             "expansion": expansion,
             "warming": warming,
             "rotation": np.zeros((*t.shape, 1)),
         }
+
+    def _read(self, y: Array) -> Array:
+        """Return the readings (n, 5), m; that of the reference state is the mean of its instants."""
+        d = y[:, :5].copy()
+        d[-1] = d[self.reference].mean(axis=0)
+        return d
 
     def _warming(self, y: Array, c: Known[Array]) -> Array:
         """Return the temperature of the frame relative to the reference state, (n, 1), K."""
@@ -156,12 +170,10 @@ class Seen:
     def _geometry(
         self, y: Array, x: Unknowns[Array], c: Known[Array]
     ) -> tuple[Array, list[Array], Array, Array, list[Array]]:
-        """Return d + o (n, 5), a by coordinate (n, 1), 1 / a_z, t (n, 5), and q by coordinate (n, 5)."""
+        """Return g d + o (n, 5), a by coordinate (n, 1), 1 / a_z, t (n, 5), and q by coordinate (n, 5)."""
         state = x.state.copy()
         state[-1] = x.reference[-1]
-        d = y[:, :5].copy()
-        d[-1] = d[self.reference].mean(axis=0)
-        d += c.run_out
+        d = c.gain * self._read(y) + c.run_out
         P, u = c.beam[0, :, :3], c.beam[0, :, 3:]  # all readings see the same rows
         expansion = c.expansion * self._warming(y, c) if self.per_kelvin.any() else np.zeros((1, 1))
         norm = np.sqrt(1.0 + state[:, 3:4] ** 2 + state[:, 4:] ** 2)
@@ -229,6 +241,8 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
     point = np.round(E0, 4) + 0.0 if settings.functional_point is None else np.array(settings.functional_point)
     if not settings.bar_radius_uncertainty:
         notes.append("Assumed: no uncertainty of the radius of the bar (bar_radius_uncertainty = 0).")
+    if not settings.gain_uncertainty:
+        notes.append("Assumed: no uncertainty of the gains of the sensors (gain_uncertainty = 0).")
     if coming_up.any():
         notes.append(
             f"{int(coming_up.sum())} means within {settings.spin_up:g} s of a change of the spindle's speed are NaN."
@@ -332,9 +346,10 @@ def _constants(
     def constant(
         group: str, value: Array, factor: Array, index: NDArray[np.intp] = one, scale: float = setup.radius, **more: Any
     ) -> Constant:
-        given = certified(raw.attrs, {group: CERTIFIED[group]}) if group in CERTIFIED else {}
-        if group in given and factor.shape[2]:
-            more["identity"] = [given[group]]
+        names = more.get("names", [group][: factor.shape[2]])
+        given = certified(raw.attrs, {name: CERTIFIED[name] for name in names if name in CERTIFIED})
+        if given:
+            more["identity"] = [given.get(name, "") for name in names]
         return Constant(value=value, factor=factor, index=index, scale=scale, group=group, **more)
 
     def scalar(group: str, value: float, u: float, scale: float = setup.radius) -> Constant:
@@ -356,6 +371,13 @@ def _constants(
     return Known(
         beam=constant(setup.group, of_beams, beam, np.tile(np.arange(5), (n + 1, 1)), names=names, identity=ids),
         radius=scalar("bar radius", setup.radius, settings.bar_radius_uncertainty),
+        gain=constant(
+            "sensor gain",
+            np.ones((1, 5)),
+            settings.gain_uncertainty * np.eye(5)[None] if settings.gain_uncertainty else np.zeros((1, 5, 0)),
+            scale=1.0,
+            names=[f"gain {name}" for name in CHANNELS] if settings.gain_uncertainty else [],
+        ),
         run_out=constant(
             "run-out at rest",
             np.zeros((len(rests) + 1, 5)),

@@ -92,6 +92,9 @@ class Settings(PluginSettings):
         description="noise of the readings: as stated, or the larger of the stated and the observed noise (auto)",
     )
     bar_radius_uncertainty: Length = Field(default=0.0, ge=0, description="standard uncertainty of the bar's radius")
+    gain_uncertainty: float = Field(
+        default=0.0, ge=0, description="relative standard uncertainty of the gain of each sensor"
+    )
     compensate_frame: bool = Field(
         default=True, description="correct the readings for the expansion of the measuring frame, where it is known"
     )

@@ -1,5 +1,7 @@
 """The measurement model of a drift: its derivatives, and what states its constants."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,9 @@ def warming(machine):
 
 
 def test_analytic_derivatives_are_those_of_differences(warming):
-    problem = observe(warming, Settings(bar_radius_uncertainty=1e-6, frame_smoothing=60.0)).problem
+    problem = observe(
+        warming, Settings(bar_radius_uncertainty=1e-6, gain_uncertainty=1e-3, frame_smoothing=60.0)
+    ).problem
     values = [*problem.start.tables, *problem.constant_tables(problem.start)]
     rows = [table.rows(value) for table, value in zip(problem.tables, values, strict=True)]
     x, c = problem.named(rows[:2], rows[2:])
@@ -182,3 +186,21 @@ def test_the_plan_of_a_campaign_has_the_frame_of_the_bench():
     stated = method.planning_settings(Settings(layout={"bar_radius": 4e-3}), {"spindle_frame": frame}).layout
     assert stated.bar_radius == 4e-3
     assert method.planning_settings(Settings(), {}).layout == Settings().layout
+
+
+def test_a_drift_has_the_relative_uncertainty_of_the_gain(warming):
+    """EZ follows from one sensor that looks along the axis; two records with the same sensors share their gains."""
+    warming.attrs["certificates"] = json.dumps({"sensor": "S-5"})
+    settings = Settings(gain_uncertainty=2e-3, compensate_frame=False, functional_point=(0.0, 0.0, 0.0))
+    errors = SpindleDrift().identify(warming, settings)
+    row = errors["influence"].sel(source="gain Z", dof="EZ").values
+    # But for the tilt over the distance of the beam from the axis: some nanometres of some micrometres.
+    np.testing.assert_allclose(row[1:], 2e-3 * errors["EZ"].values[1:], rtol=2e-3)
+    ids = dict(zip(errors["source"].values.tolist(), errors["source_id"].values.tolist(), strict=True))
+    assert ids["gain Z"] == "certificate S-5: sensor, gain Z"
+    assert set(errors["source_group"].values) == set(SpindleDrift().plan(settings)["source_group"].values)
+    changed = warming.assign(
+        distance=1.002 * warming["distance"].where(warming["channel"] == "Z", warming["distance"] / 1.002)
+    )
+    moved = SpindleDrift().identify(changed, settings)
+    np.testing.assert_allclose((moved["EZ"] - errors["EZ"]).values[1:], row[1:], rtol=1e-3)
