@@ -8,7 +8,7 @@ import xarray as xr
 
 from errormotion import plugins
 from errormotion.datasets import build_errors
-from errormotion.plugins import FigureOfMerit
+from errormotion.plugins import FigureOfMerit, Method
 from errormotion.report import write_report
 from errormotion.report.document import Cell, Figure, Source
 from errormotion.report.elements import (
@@ -38,7 +38,7 @@ GAIN, NOISE = 0.3e-6, 0.05e-6
 """Standard uncertainties of EX by a source that all angles share, and by noise, m."""
 
 
-class Turning:
+class Turning(Method):
     """A method outside of this repository, without chapters: it only states its figures."""
 
     limit: float | None = None
@@ -91,7 +91,7 @@ def over_angles(value=20e-6, **more):
 @pytest.fixture
 def foreign(monkeypatch):
     """Make `Turning` the owner of its datasets."""
-    method = Turning()
+    method = type("Own", (Turning,), {})
     known = plugins.owner_of_method
     monkeypatch.setattr(plugins, "owner_of_method", lambda name: method if name == "turning" else known(name))
     return method
@@ -160,7 +160,7 @@ def test_effects_of_sources_follow_from_the_change_of_a_figure(foreign):
     def figures(errors):
         return [FigureOfMerit("first", 2 * float(errors["EX"][0]), 2e-6, "m", 3e-6)]
 
-    foreign.figures = figures
+    foreign.figures = staticmethod(figures)
     words = [each for each in generic.part(Source(over_angles()), "p1").summary if each.startswith("U of first")]
     # The figure is twice an error: 2 * 0.3 um of u = 1 um, 36 % of the variance; the rest is noise.
     assert "'independent noise' with 64 % of the variance: more readings would lower it, to 1.2 µm at best." in words[0]
@@ -171,7 +171,7 @@ def test_figures_that_cannot_be_computed_do_not_prevent_a_report(foreign, tmp_pa
     def figures(errors):
         raise KeyError(errors.attrs["machine"])
 
-    foreign.figures = figures
+    foreign.figures = staticmethod(figures)
     page = text_of(write_report(over_angles(), tmp_path / "report.html"))
     assert "The figures of merit could not be computed: KeyError: &#39;Five-axis machine&#39;." in page
     assert "EXC" in page
@@ -228,6 +228,16 @@ def test_a_part_without_its_variables_is_left_out_or_a_note():
 def test_a_unit_that_is_unknown_is_refused():
     with pytest.raises(ValueError, match="expected one of m, mm, um"):
         blocks_of(Table("Errors.", (Column("EX", unit="inch"),), over="angle"))
+
+
+def test_several_values_in_a_row_are_refused_without_a_reduction():
+    with pytest.raises(ValueError, match="Column 'residual': it has several values over angle in each row"):
+        blocks_of(Table("Residuals.", (Column("residual"),), over="sensor"))
+
+
+def test_curves_leave_out_quantities_over_other_dims():
+    (figure,) = blocks_of(Curves(variables=("EX", "location", "EA")))
+    assert figure.alt == "Curves over angle: EXC −20.00 to 20.00 µm; EAC −2.06 to 2.06 arcsec."
 
 
 def test_curves_state_their_bands_and_spans():

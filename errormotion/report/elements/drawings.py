@@ -38,7 +38,8 @@ class Curves:
     caption : str
         `{name}` is replaced by an attribute of the dataset, ``{over}`` by the dim.
     variables : sequence
-        One panel each: the name of a variable or freedom, an `Of`, or several of one unit. By default the errors.
+        One panel each: the name of a variable or freedom, an `Of`, or several of one unit. By default the errors. Those
+        over other dims than the first are left out.
     over : str
         Dim of the abscissa; by default the time, else the longest dim of the first quantity.
     band : bool
@@ -76,6 +77,8 @@ class Curves:
         if not any(np.isfinite(each.values.values.astype(float)).any() for each in flat):
             return [Text(self.absent, "note")] if self.absent else []
         dims = [str(dim) for dim in flat[0].values.dims]
+        found = [[each for each in panel if set(each.values.dims) == set(dims)] for panel in found]
+        found, flat = [panel for panel in found if panel], [each for panel in found for each in panel]
         along = self.over or max(dims, key=lambda dim: (dim == "time", ds.sizes[dim]), default="")
         if along not in dims:
             return []

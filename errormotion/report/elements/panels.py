@@ -158,7 +158,7 @@ def grid(
 def beside(axes: Axes) -> tuple[float, float]:
     """Return the place of the label of an ordinate at the left edge of the drawing, in parts of the panel."""
     wide = axes.get_position().width * axes.figure.get_figwidth()  # type: ignore[union-attr]
-    return -(_LEFT - 0.09) / wide, 0.5
+    return -(_LEFT - 0.12) / wide, 0.5
 
 
 def empty(axes: Axes) -> None:

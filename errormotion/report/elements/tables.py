@@ -196,6 +196,12 @@ def _column(
     values, u = (_over(each, ds, over) for each in (quantity.values, quantity.u))
     reasons = _over(ds[column.reason], ds, over) if column.reason in ds.variables else None
     assert values is not None
+    spare = [str(dim) for dim in quantity.values.dims if dim not in over and quantity.values.sizes[dim] > 1]
+    if spare and not column.reduce:
+        raise ValueError(
+            f"Column '{quantity.name}': it has several values over {', '.join(spare)} in each row; expected 'reduce' "
+            f"({', '.join(REDUCTIONS)}), or 'select'"
+        )
     for index in np.ndindex(*shape):
         each = values[index]
         if each.dtype.kind in "UO":

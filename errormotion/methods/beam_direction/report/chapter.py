@@ -1,4 +1,8 @@
-"""The chapter of the direction of a beam: comparison with nominal, planes, inclination error, check bar."""
+"""The chapter of the direction of a beam: comparison with nominal, planes, inclination error, check bar.
+
+It is not made of `errormotion.report.elements`: its drawings are its own, and its tables contain quantities that are
+derived from beam and planes, which as datasets for the parts would be longer than the tables.
+"""
 
 from __future__ import annotations
 
