@@ -59,8 +59,6 @@ VARIANTS: dict[str, list[dict[str, Any]]] = {
     "beam_direction-0": [{"robust": False}, {"ordered": False}, {"noise": "stated"}],
     "virtual_beam-campaign-beam": [{"compensation": None}],
     "multilateration-0": [
-        {"alternating": True},
-        {"start": "distances"},
         {"robust": False, "noise": "stated"},
         {"together": True},
         {"drift": "none", "parametric": False},
