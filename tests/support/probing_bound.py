@@ -49,7 +49,7 @@ def bound(
         has every touch, both give the same twists.
     """
     b, m, _ = position.shape
-    H = motion.design(motion.lever(position), normal).reshape(b * m, -1)
+    H = motion.design(position, normal).reshape(b * m, -1)
     p = H.shape[1]
     if time is not None and touch_time is not None:
         cycles = len(time)

@@ -32,7 +32,7 @@ from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places
 from errormotion.kinematics.iso import DOF
 from errormotion.measurement import Observed
-from errormotion.methods.normal_vector.identification.freedoms import FLAT, Motion, check_layout, rotated, spread
+from errormotion.methods.normal_vector.identification.freedoms import FLAT, Motion, check_layout, spread
 from errormotion.methods.normal_vector.identification.reading import (
     Readings,
     check_balls,
@@ -180,7 +180,7 @@ class Probing:
 
     def _true(self, y: Array, x: Unknowns[Array]) -> Array:
         """Return the true positions of the tip, (n, 3)."""
-        return np.asarray(y + self.motion.error(self.motion.full(x.twist), self.motion.lever(y)))
+        return np.asarray(y + self.motion.error(x.twist, y))
 
     def _distance(self, y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
         return np.asarray(np.linalg.norm(self._true(y, x) - c.centre, axis=1) - x.reach[:, 0])
@@ -190,23 +190,21 @@ class Probing:
 
     def _of_distance(self, y: Array, x: Unknowns[Array], c: Known[Array]) -> dict[str, Array]:
         """Return the derivatives of the distance by twist, reach and position."""
-        motion, rotation = self.motion, self.motion.full(x.twist)[:, 3:]
         away = self._true(y, x) - c.centre
         length = np.linalg.norm(away, axis=1, keepdims=True)
         normal = away / np.where(length > 0, length, 1.0)
         return {
-            "twist": motion.design(rotated(rotation, motion.lever(y)), normal)[:, None],
+            "twist": self.motion.design(y, normal, x.twist)[:, None],
             "reach": np.full((len(y), 1, 1), -1.0),
             "readings": normal[:, None],  # the stated noise is that along the normal
         }
 
     def _of_difference(self, y: Array, x: Unknowns[Array], _: Any) -> dict[str, Array]:
         """Return the derivatives of the coordinates by twist, centre and position."""
-        motion, rotation = self.motion, self.motion.full(x.twist)[:, None, 3:]
         axes = np.broadcast_to(np.eye(3), (len(y), 3, 3))
-        lever = rotated(rotation, motion.lever(y)[:, None])
+        position = np.broadcast_to(y[:, None], axes.shape)
         return {
-            "twist": motion.design(np.broadcast_to(lever, axes.shape), axes),
+            "twist": self.motion.design(position, axes, x.twist[:, None]),
             "reach": -axes,
             "readings": axes,
         }
@@ -395,7 +393,7 @@ def determines_motion(seen: Observations, motion: Motion, anchor: Array) -> NDAr
         normal = away / np.where(length > 0, length, 1.0)
     else:
         normal = np.broadcast_to(np.eye(3), (*seen.position.shape[:2], 3, 3))
-    H = motion.design(motion.lever(seen.position), normal)
+    H = motion.design(seen.position, normal)
     H = H / np.where(np.array(motion.seen) < 3, 1.0, spread_of(seen))
     H = np.where(seen.valid[..., None], H, 0.0).reshape(len(H), -1, H.shape[-1])
     N = np.swapaxes(H, 1, 2) @ H

@@ -205,9 +205,8 @@ def _at_cycle_time(probing: Probing, solved: Solved, seen: Observations) -> Obse
     if not probing.interpolate or not seen.touched:
         return seen
     motion, twist = probing.motion, solved.fit.unknowns.twist
-    lever = motion.lever(seen.position)
     at_touch = solved.fit.problem.unknowns.twist.rows(twist).reshape(*seen.time.shape, -1)
-    drift = motion.error(motion.full(at_touch), lever) - motion.error(motion.full(twist)[:, None, None], lever)
+    drift = motion.error(at_touch, seen.position) - motion.error(twist[:, None, None], seen.position)
     return replace(seen, position=seen.position + np.where(seen.valid[..., None], drift, 0.0))
 
 

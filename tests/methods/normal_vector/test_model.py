@@ -40,7 +40,9 @@ def touches(axes, cycles=5, count=5, noise=0.0, drift=DRIFT, seed=0, duration=10
     way = np.full(time.shape, REACH)
     for _ in range(20):
         place = ball[:, None] + way[..., None] * normal
-        way -= np.linalg.norm(place + motion.error(true, motion.lever(place)) - ball[:, None], axis=-1) - reach
+        way -= (
+            np.linalg.norm(place + motion.error(true[..., list(motion.seen)], place) - ball[:, None], axis=-1) - reach
+        )
     place = ball[:, None] + (way + noise * rng.normal(size=way.shape))[..., None] * normal
     weight = np.zeros((*time.shape, count))
     weight[..., range(count), range(count)] = 1.0

@@ -61,18 +61,22 @@ class Motion:
         found[..., list(self.seen)] = values
         return found
 
-    def lever(self, position: Array) -> Array:
-        """Return M (p - f) of positions (..., 3), m."""
-        return (position - self.point) * self.carries
-
-    def error(self, twist: Array, lever: Array) -> Array:
-        """Return e of twists (..., 6) at levers (..., 3); the rotation vector is applied exactly."""
+    def error(self, values: Array, position: Array) -> Array:
+        """Return e at positions (..., 3), m, for the errors that are determined, (..., p)."""
+        twist, lever = self.full(values), self._lever(position)
         return twist[..., :3] + rotated(twist[..., 3:], lever) - lever
 
-    def design(self, lever: Array, normal: Array) -> Array:
-        """Return the derivative of the error along unit vectors (..., 3), at rotated levers (..., 3), (..., p)."""
+    def design(self, position: Array, normal: Array, values: Array | None = None) -> Array:
+        """Return the derivatives (..., p) of e along unit vectors (..., 3), at errors (..., p); at 0 by default."""
+        lever = self._lever(position)
+        if values is not None:
+            lever = rotated(self.full(values)[..., 3:], lever)
         full = np.concatenate([normal, np.cross(lever, normal)], axis=-1)
         return full if len(self.seen) == 6 else np.asarray(full[..., list(self.seen)])
+
+    def _lever(self, position: Array) -> Array:
+        """Return M (p - f) of positions (..., 3), m."""
+        return (position - self.point) * self.carries
 
 
 def rotated(rotation: Array, vector: Array) -> Array:
@@ -132,7 +136,7 @@ def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
 
 def undetermined(centres: Array, motion: Motion) -> list[int]:
     """Return the errors in ``motion.seen`` that balls at centres (ball, 3), m, leave undetermined."""
-    design = np.stack([motion.design(motion.lever(centres), np.tile(axis, (len(centres), 1))) for axis in np.eye(3)])
+    design = np.stack([motion.design(centres, np.tile(axis, (len(centres), 1))) for axis in np.eye(3)])
     A = design.reshape(-1, len(motion.seen))
     A = A / np.where(np.array(motion.seen) < 3, 1.0, spread(centres) or 1.0)
     _, size, directions = np.linalg.svd(A)
