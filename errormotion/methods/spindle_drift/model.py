@@ -247,7 +247,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         notes.append(
             f"{int(coming_up.sum())} means within {settings.spin_up:g} s of a change of the spindle's speed are NaN."
         )
-    sigma = noise(raw, record, settings, notes).T
+    sigma = np.where(np.isfinite(averages.mean), noise(raw, record, settings, notes), 0.0).T
     parts, own = (
         (None, None) if warming is None else smoothing_sources(warming.smoothing, warming.noise, time, reference)
     )

@@ -1,4 +1,8 @@
-"""Raw data of the method, simulated on the virtual machine without instruments: fast enough for Monte Carlo."""
+"""Raw data of the method, simulated on the virtual machine without instruments: fast enough for Monte Carlo.
+
+They do not follow from the measurement model of the method, so that they test its equation: the bar and the spindle of
+the virtual machine, its warm-up and its frame are those of another code.
+"""
 
 from __future__ import annotations
 
