@@ -17,7 +17,7 @@ from errormotion.methods.normal_vector.acquisition import touching
 from errormotion.methods.normal_vector.acquisition.cycle import TIP_RADIUS, cycles
 from errormotion.methods.normal_vector.identification import normals
 from errormotion.methods.normal_vector.identification.freedoms import Motion, check_layout
-from errormotion.methods.normal_vector.schema import SCHEMA
+from errormotion.methods.normal_vector.schema import RESULT, SCHEMA
 
 if TYPE_CHECKING:
     from errormotion.methods.normal_vector.settings import Settings
@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 NOISE = 0.25e-6
 """Noise of a touch where the settings have none, m."""
 
-MEASURED = (
-    *("centre", "centre_covariance", "ball_displacement", "residual", "left_out", "ball_moved", "noise"),
-    *("normals_errors", "normals_covariance", "cycle_time", "direction", "direction_"),
-)
+MEASURED = [*(name for name in RESULT if name != "normals_loss"), "cycle_time", "direction", "direction_"]
 """Variables of a result that a plan has not."""
 
 _M, _S = {"units": "m"}, {"units": "s"}

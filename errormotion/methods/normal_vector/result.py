@@ -22,6 +22,7 @@ from errormotion.methods.normal_vector.contradiction import contradiction
 from errormotion.methods.normal_vector.identification import normals
 from errormotion.methods.normal_vector.identification.spheres import Centres, Observations, centres
 from errormotion.methods.normal_vector.model import COLD, Probing
+from errormotion.methods.normal_vector.schema import EACH, RESULT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -268,8 +269,6 @@ def _extras(
     """Return the further variables of the result."""
     k, b, m = probing.shape
     valid = probing.data.seen.valid
-    metre = {"units": "m"}
-    each = ("time", "ball", "touch" if probing.data.seen.touched else "direction")
     flag = np.where(valid, 0, 1)
     moved = np.zeros((k, b), dtype=np.int8)
     for _, ball, cycle in excluded.moves:
@@ -277,46 +276,25 @@ def _extras(
     flag[(moved[..., None] > 0) & (flag == 0)] = 3
     flag[excluded.wrong & valid] = 2
     flag[excluded.lost] = np.where(flag[excluded.lost] == 0, 4, flag[excluded.lost])
-    dof = ("time", "dof")
     plain, C, loss = np.full((k, 6), np.nan), np.full((k, 6, 6), np.nan), np.full((k, 6), np.nan)
     if other is not None:
         plain, C = other.value, other.covariance
         u, u_best = (np.sqrt(np.einsum("kii->ki", each.covariance)) for each in (other, best))
         loss = np.where(u_best > 0, u / np.where(u_best > 0, u_best, 1.0), np.nan)
-    extras = {
-        "centre": (
-            ("time", "ball", "direction"),
-            measured.centre,
-            {**metre, "long_name": "apparent centre in machine coordinates"},
-        ),
-        "centre_covariance": (
-            ("time", "ball", "direction", "direction_"),
-            noise**2 * measured.cofactor,
-            {"units": "m^2", "long_name": "from the touches of the cycle itself"},
-        ),
-        "ball_displacement": (
-            ("time", "ball", "direction"),
-            measured.centre - measured.centre[0],
-            {**metre, "long_name": "apparent, since the cold cycle: opposite to the error"},
-        ),
-        "residual": (
-            each,
-            solved.fit.residual.reshape(k, b, m),
-            {**metre, "long_name": "measured minus fitted distance"},
-        ),
-        "left_out": (
-            each,
-            flag.astype(np.int8),
-            {"long_name": "0 = used, 1 = missing, 2 = outlier, 3 = ball had moved, 4 = cycle not determined"},
-        ),
-        "ball_moved": (("time", "ball"), moved, {"long_name": "1 from the first cycle after a move of the ball"}),
-        "normals_errors": (dof, plain, {"long_name": "by the normals of two planes; m, rad"}),
-        "normals_covariance": ((*dof, "dof_"), C, {"long_name": "m^2, m rad, rad^2"}),
-        "normals_loss": (
-            dof,
-            loss,
-            {"units": "1", "long_name": "standard uncertainty by the normals over that by all touches"},
-        ),
-        "noise": ((), noise, metre),
+    values = {
+        "centre": measured.centre,
+        "centre_covariance": noise**2 * measured.cofactor,
+        "ball_displacement": measured.centre - measured.centre[0],
+        "residual": solved.fit.residual.reshape(k, b, m),
+        "left_out": flag.astype(np.int8),
+        "ball_moved": moved,
+        "normals_errors": plain,
+        "normals_covariance": C,
+        "normals_loss": loss,
+        "noise": noise,
     }
-    return {name: xr.DataArray(array, dims=dims, attrs=attrs) for name, (dims, array, attrs) in extras.items()}
+    each = EACH if probing.data.seen.touched else "direction"
+    return {
+        name: xr.DataArray(values[name], dims=[each if dim == EACH else dim for dim in dims], attrs=attrs)
+        for name, (dims, attrs) in RESULT.items()
+    }

@@ -101,3 +101,32 @@ RAW_SCHEMAS = (
         labels=XYZ,
     ),
 )
+
+EACH = "touch"
+"""Dim of the numbers of a ball; "direction" where centres were given."""
+
+RESULT: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    "centre": (("time", "ball", "direction"), {"units": "m", "long_name": "apparent centre in machine coordinates"}),
+    "centre_covariance": (
+        ("time", "ball", "direction", "direction_"),
+        {"units": "m^2", "long_name": "from the touches of the cycle itself"},
+    ),
+    "ball_displacement": (
+        ("time", "ball", "direction"),
+        {"units": "m", "long_name": "apparent, since the cold cycle: opposite to the error"},
+    ),
+    "residual": (("time", "ball", EACH), {"units": "m", "long_name": "measured minus fitted distance"}),
+    "left_out": (
+        ("time", "ball", EACH),
+        {"long_name": "0 = used, 1 = missing, 2 = outlier, 3 = ball had moved, 4 = cycle not determined"},
+    ),
+    "ball_moved": (("time", "ball"), {"long_name": "1 from the first cycle after a move of the ball"}),
+    "normals_errors": (("time", "dof"), {"long_name": "by the normals of two planes; m, rad"}),
+    "normals_covariance": (("time", "dof", "dof_"), {"long_name": "m^2, m rad, rad^2"}),
+    "normals_loss": (
+        ("time", "dof"),
+        {"units": "1", "long_name": "standard uncertainty by the normals over that by all touches"},
+    ),
+    "noise": ((), {"units": "m"}),
+}
+"""Dims and attributes of the further variables of a result."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
+from errormotion.methods.normal_vector.schema import EACH, RESULT
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.provenance import read
 
@@ -119,12 +119,13 @@ class Probing:
 
 def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
     """Return the arrays of a dataset; the flags of the probe are in ``raw``."""
-    each = "touch" if "residual" not in errors or "touch" in errors["residual"].dims else "direction"
+    each = EACH if "residual" not in errors or EACH in errors["residual"].dims else "direction"
     t, b = errors.sizes["time"], errors.sizes.get("ball", 0)
     m = errors.sizes.get(each, 0) if "residual" in errors else 0
     sizes = {"time": t, "ball": b, each: m, "direction": 3, "dof": 6, "dof_": 6, "direction_": 3}
 
-    def get(name: str, *dims: str) -> Array:
+    def get(name: str) -> Array:
+        dims = [each if dim == EACH else dim for dim in RESULT[name][0]]
         shape = tuple(sizes[dim] for dim in dims)
         if name not in errors or set(errors[name].dims) != set(dims) or errors[name].dtype.kind not in "iufb":
             return np.full(shape, np.nan)
@@ -134,8 +135,7 @@ def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
     def deviation(variance: Array) -> Array:
         return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
-    spread = get("centre_covariance", "time", "ball", "direction", "direction_")
-    plain = get("normals_covariance", "time", "dof", "dof_")
+    spread, plain = get("centre_covariance"), get("normals_covariance")
     procedure = read(errors).get("settings", {})
     procedure = procedure.get("procedure") if isinstance(procedure, dict) else None
     return Probing(
@@ -143,18 +143,18 @@ def probing(errors: xr.Dataset, raw: xr.Dataset | None = None) -> Probing:
         [str(name) for name in errors["ball"].values] if "ball" in errors.coords else [f"B{i + 1}" for i in range(b)],
         np.stack([np.asarray(errors[name].values, float) for name in FREEDOMS], axis=-1),
         deviation(np.diagonal(errors["covariance"].transpose("time", "dof", "dof_").values, axis1=1, axis2=2)),
-        get("centre", "time", "ball", "direction"),
+        get("centre"),
         deviation(np.diagonal(spread, axis1=2, axis2=3)),
-        get("ball_displacement", "time", "ball", "direction"),
-        np.nan_to_num(get("ball_moved", "time", "ball")) > 0,
-        get("residual", "time", "ball", each),
-        np.nan_to_num(get("left_out", "time", "ball", each), nan=MISSING).astype(np.int64),
+        get("ball_displacement"),
+        np.nan_to_num(get("ball_moved")) > 0,
+        get("residual"),
+        np.nan_to_num(get("left_out"), nan=MISSING).astype(np.int64),
         _flags(raw, (t, b, m)),
-        get("normals_errors", "time", "dof"),
+        get("normals_errors"),
         deviation(np.diagonal(plain, axis1=1, axis2=2)),
-        get("normals_loss", "time", "dof"),
-        float(errors["noise"]) if "noise" in errors and errors["noise"].ndim == 0 else math.nan,
-        each == "touch",
+        get("normals_loss"),
+        float(get("noise")),
+        each == EACH,
         procedure == "normals",
         str(errors.attrs.get("tool_axes", "")),
     )
