@@ -6,8 +6,9 @@ Model of a reading of approach a, run j, target i, with the position scaled to z
 
 ``o`` and ``q`` are an offset and a slope that both approaches of a run share (drift of the machine, expansion of its
 scale); ``p`` and ``w`` have the sign of the approach. All are independent from run to run: random effects, whose
-variances and that of e are estimated by restricted likelihood (`errormotion.estimation.components`). If no reading is
-missing, and no variance is 0, these are the estimates of an analysis of variance.
+variances are estimated by restricted likelihood (`errormotion.estimation.components`). That of e is the scatter about
+lines through each run and approach, whatever these are. If no reading is missing, and no variance is 0, these are the
+estimates of an analysis of variance.
 
 An estimated variance has the Student factor of `errormotion.estimation.variance.expansion`, with which an interval of
 k = 2 contains the truth in 95 % of all cases or more, whatever the degrees of freedom. It belongs to the variance of a
@@ -45,6 +46,8 @@ MIN_FREEDOM = 3
 """Smallest number of degrees of freedom for the scatter of all readings."""
 SIGNIFICANT = 1e-3
 """Probability in Bartlett's test of equal variances below which each target has its own variance."""
+ANY = 10.0
+"""Standard deviation of the effects of a run about which nothing is known, in that of the readings."""
 SMALLEST = 1e-6
 """Variance of a target, of the common one, below which its readings agree by accident, or by rounding."""
 EQUAL = 1e-15
@@ -141,12 +144,9 @@ def scatter(
             freedom=np.zeros(4), pooled=True,
         )  # fmt: skip
     _check_freedom(known)
-    found = _estimated(x, z, None, both)
-    own, freedom, pooled, unequal = _own(found, x.shape, kind)
+    own, freedom, pooled, unequal = _own(_estimated(x, z, None, both), x.shape, kind)
     own = np.where(seen, own, np.nan)
-    if not pooled:
-        found = _estimated(x, z, own, both)
-    run, noise, of_run = _of_runs(found, z, both)
+    run, noise, of_run = _of_runs(_estimated(x, z, own, both), z, both)
     student = np.square(expansion(freedom))
     if runs >= MIN_RUNS:
         more = (np.square(expansion(of_run)) - 1.0) * (run + noise) - (student - 1.0) * noise
@@ -201,7 +201,12 @@ def _check_freedom(known: NDArray[np.bool_]) -> None:
 
 
 def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
-    """Return the variances of the runs' effects and of a reading, whose ratios are those of ``own``."""
+    """Return the variances of the runs' effects, with a noise in the ratios of ``own``.
+
+    Without ``own`` the effects of a run may be any, and only the noise is estimated. Otherwise an effect whose variance
+    is estimated as 0 would count as noise, although it is smaller than noise by accident: the estimate would be 7 % too
+    small without drift.
+    """
     a, j, i = (index.ravel() for index in np.indices(x.shape))
     sign, one = np.where(a == 0, 1.0, -1.0), np.ones(a.size)
     designs = Unknowns(np.stack([one, sign], axis=1), np.stack([one, z[i], sign, sign * z[i]], axis=1))
@@ -235,14 +240,15 @@ def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
                 scale=1.0,
                 free=np.tile(used, (x.shape[1], 1)),
                 group="runs",
-                component=tuple(np.where(used, EFFECTS, "")),
+                prior=ANY * spread if own is None else None,
+                component=() if own is None else tuple(np.where(used, EFFECTS, "")),
             ),
         ),
         noise=Noise(sd=np.nan_to_num(sd, nan=spread), stated=False),
         derivatives=lambda *_: derivatives,
     )
     try:
-        return components(problem)
+        return components(problem, noise=True)
     except FitError as error:
         raise MethodError(f"deviation: expected readings that determine their scatter; {error}.") from error
 
@@ -307,6 +313,7 @@ def _of_runs(found: Components, z: Array, both: bool) -> tuple[Array, Array, Arr
     effect, at_border = fit.normal.solve(a, b)
     V = np.einsum("rpk,rpk->k", a, effect)
     by_name = dict(zip(found.names, zip(found.variance, found.used, strict=True), strict=True))
+    factor = by_name[NOISE][1]  # the noise of the fit, of that in the weights
     run, noise, freedom = np.zeros(4), np.zeros(4), found.freedom_of(a, b)
     for k, name in enumerate(EFFECTS):
         if name not in by_name or not V[k] > 0:
@@ -314,5 +321,5 @@ def _of_runs(found: Components, z: Array, both: bool) -> tuple[Array, Array, Arr
         run[k], used = by_name[name]
         # V = sum of the squared effects of the runs on it, n^-1 s each ... and the part of the noise
         part = float(np.sum(np.square(at_border[fit.linear.numbering.border[1][:, k], k]))) / used
-        noise[k] = max(V[k] - part, 0.0) * used / part
+        noise[k] = max(V[k] - part, 0.0) / factor * used / part
     return run, noise, freedom
