@@ -148,6 +148,15 @@ def test_an_uncertainty_is_compared_with_the_value_without_a_limit():
     assert any(words.startswith("U of EX0C is 0.61 µm, which is large against its value.") for words in small.summary)
 
 
+def test_a_number_has_no_unit_and_further_figures_are_counted(foreign):
+    foreign.figures = staticmethod(
+        lambda errors: [FigureOfMerit(f"ratio {k}", 0.1, 0.2, "1", influence={"gain": 0.1}) for k in range(6)]
+    )
+    (words,) = [each for each in generic.part(Source(over_angles()), "p1").summary if each.startswith("U of")]
+    assert words.startswith("U of ratio 0 is 0.20, which is large against its value.")
+    assert words.endswith("to 0 at best. The same applies to ratio 1, ratio 2, ratio 3 and 2 more.")
+
+
 def test_a_limit_of_a_campaign_is_that_of_the_figure(foreign):
     source = Source(over_angles(), limits={"EX*": (-1.5e-6, 1.5e-6)})
     made = generic.part(source, "p1")

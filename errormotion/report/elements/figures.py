@@ -26,8 +26,8 @@ LARGE_OF_VALUE = 0.5
 INDEPENDENT = "independent"
 _MOST = 8
 """Key figures; the table contains all."""
-_NAMED = 4
-"""Names in a sentence."""
+_NAMED = 3
+"""Further names in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class KeyFigures:
             name, _, place = each.name.partition(" at ")
             note = self.note or place if stated else "largest"
             if math.isfinite(limit):
-                note = f"limit {significant(limit / size, 3)} {unit}"
+                note = f"limit {_with(significant(limit / size, 3), unit)}"
             cell = estimate(each.value / size, each.expanded_uncertainty / size, signed=self.signed or not stated)
             found.append(KeyFigure(name, cell, unit, note, named=True))
         return found
@@ -72,7 +72,7 @@ class KeyFigures:
         if is_planned(source.errors):
             return []
         stated = chosen(source, self.names) or largest(source)
-        return reasons(source, [each for each in stated if is_large(source, each)])
+        return reasons(source, [each for each in stated if is_large(source, each)], self.units)
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def by_group(source: Source, figure: FigureOfMerit) -> dict[str, float]:
     return found
 
 
-def reasons(source: Source, figures: Sequence[FigureOfMerit]) -> list[str]:
+def reasons(source: Source, figures: Sequence[FigureOfMerit], units: Mapping[str, str] | None = None) -> list[str]:
     """Return which group of sources makes these uncertainties large, and what they would be without it."""
     leading: dict[str, list[tuple[FigureOfMerit, float]]] = {}
     for each in figures:
@@ -232,17 +232,21 @@ def reasons(source: Source, figures: Sequence[FigureOfMerit]) -> list[str]:
     words = []
     for group, found in leading.items():
         first, share = max(found, key=lambda each: each[1])
-        unit, size = unit_of(first.unit)
-        U = first.expanded_uncertainty / size
-        limit = limit_of(source, first)
-        against = f"its limit {significant(limit / size, 3)} {unit}" if math.isfinite(limit) else "its value"
+        unit, size = unit_of(first.unit, (units or {}).get(first.unit, ""))
+        U, limit = first.expanded_uncertainty / size, limit_of(source, first)
+        against = f"its limit {_with(significant(limit / size, 3), unit)}" if math.isfinite(limit) else "its value"
         without = rounded(0.0, U * math.sqrt(max(1 - share, 0.0)))[1] if share < 1 - 1e-6 else "0"
-        others = [each.name for each, _ in found if each is not first][: _NAMED - 1]
+        others = [each.name for each, _ in found if each is not first]
+        others[_NAMED:] = [f"{len(others) - _NAMED} more"] if len(others) > _NAMED else []
         more = f" The same applies to {listed(others)}." if others else ""
         remedy = "more readings" if group == INDEPENDENT else "a smaller uncertainty of this source"
         words.append(
-            f"U of {first.name} is {significant(U)} {unit}, which is large against {against}. Its largest source is "
-            f"'{readable(group)}' with {fixed(100 * share, 0)} % of the variance: {remedy} would lower it, to "
-            f"{without} {unit} at best.{more}"
+            f"U of {first.name} is {_with(significant(U), unit)}, which is large against {against}. Its largest source "
+            f"is '{readable(group)}' with {fixed(100 * share, 0)} % of the variance: {remedy} would lower it, to "
+            f"{_with(without, unit)} at best.{more}"
         )
     return words
+
+
+def _with(number: str, unit: str) -> str:
+    return f"{number} {unit}".strip()
