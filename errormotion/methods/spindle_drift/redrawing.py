@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from errormotion.methods.spindle_drift.identification.beams import RADIUS_OF_SPHERE, SCALES
 from errormotion.methods.spindle_drift.identification.detection import segmented
 from errormotion.methods.spindle_drift.settings import TrialSettings
 from errormotion.plugins import Redraw, Redrawing, replaced
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def redrawing_of_beams(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
-    """Return the readings of the stepped sphere; their noise is that of the residuals of each beam."""
+    """Return the readings of the stepped sphere, with the noise of each beam's residuals; radius; and scales."""
     steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
     steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
     sigma = errors["noise"].sel(beam=[str(name) for name in raw["channel"].values]).values[:, None, None]
@@ -25,4 +26,20 @@ def redrawing_of_beams(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) 
         distance = raw.variables["distance"].values
         return replaced(raw, {"distance": distance + sigma * generator.normal(size=distance.shape)}), settings
 
-    return Redrawing(steps, TrialSettings.of(settings), {"readings": Redraw(draw, own=True)})
+    def radius(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        drawn = raw["sphere_radius"].values + raw["sphere_radius_uncertainty"].values * generator.normal()
+        return replaced(raw, {"sphere_radius": drawn}), settings
+
+    def scales(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+        centre = raw.variables["sphere_centre"].transpose("channel", "profile", "step", "direction")
+        middle = np.nanmean(centre.values, axis=(0, 1, 2))
+        factor = 1 + raw["position_scale_uncertainty"].values * generator.normal(size=3)
+        drawn = centre.copy(data=middle + (centre.values - middle) * factor)
+        return raw.assign(sphere_centre=drawn), settings
+
+    sources = {"readings": Redraw(draw, own=True)}
+    if float(steps.get("sphere_radius_uncertainty", 0.0)) > 0:
+        sources[RADIUS_OF_SPHERE] = Redraw(radius, groups=(RADIUS_OF_SPHERE,))
+    if float(steps.get("position_scale_uncertainty", 0.0)) > 0:
+        sources[SCALES] = Redraw(scales, groups=(SCALES,))
+    return Redrawing(steps, TrialSettings.of(settings), sources)

@@ -88,6 +88,38 @@ def test_beams_are_found_within_their_uncertainty_from_the_record(machine, metho
     assert beams.attrs["notes"] == [""]
 
 
+@pytest.mark.slow
+def test_radius_and_scales_are_sources_that_all_beams_have_in_common(machine, method):
+    raw = simulation.raw_beam_detection(machine, seed=1).isel(step=slice(None, None, 10))
+    plain = method.identify(raw)
+    uncertain = raw.assign(
+        sphere_radius_uncertainty=((), 1e-6, {"units": "m"}), position_scale_uncertainty=((), 1e-4, {"units": "1"})
+    ).assign_attrs(certificates='{"sphere": "17"}')
+    beams = method.identify(uncertain)
+    validate(beams)
+    assert set(beams["source_group"].values) == {"radius of the sphere", "scales of the positions"}
+    F = np.nan_to_num(beams["influence"].values)
+    total = np.einsum("sbi,sbj->bij", F, F)
+    added = np.nan_to_num(beams["covariance"].values - plain["covariance"].values)
+    np.testing.assert_allclose(added, total, atol=1e-3 * np.abs(total).max())
+    ids = dict(zip(beams["source"].values.tolist(), beams["source_id"].values.tolist(), strict=True))
+    assert ids["radius of the sphere"]
+    assert not ids["scale of the positions X"]
+    # Each draw changes the beams as its source states.
+    trials = method.redrawing(uncertain, SETTINGS, beams)
+    for name, groups in (("radius of the sphere", 1), ("scales of the positions", 3)):
+        rng = np.random.default_rng(0)
+        draws = [trials.sources[name].draw(trials.raw, trials.settings, rng) for _ in range(40)]
+        moved = [method.identify(*each).em.twist() for each in draws]
+        spread = np.std(np.nan_to_num(np.array(moved)), axis=0)
+        stated = np.sqrt(np.sum(np.square(F[[g == name for g in beams["source_group"].values]]), axis=0))
+        u = np.sqrt(np.nan_to_num(np.diagonal(beams["covariance"].values, axis1=1, axis2=2)))
+        # The standard deviation of one of 40 draws is 11 %; each draw has its own correlation of the noise.
+        assert (np.abs(spread - stated) <= 0.4 * stated + 0.01 * u).all()
+        assert (stated > 0.5 * u).any()
+        assert groups == sum(g == name for g in beams["source_group"].values)
+
+
 def test_last_attempt_of_a_repeated_scan_is_used(method, recorded):
     whole = method.identify(recorded, SETTINGS)
     second = recorded.assign(attempt=recorded["attempt"] + 1)

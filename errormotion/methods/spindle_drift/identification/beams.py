@@ -15,23 +15,29 @@ Source: Geiselhart et al. (euspen 2024), section 2.3.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.estimation.robust import scale_about_median
-from errormotion.kinematics.beams import across, turned
+from errormotion.estimation.blocks import Block, Constant, Noise
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.sources import Places
+from errormotion.kinematics.beams import across
+from errormotion.measurement.identification import solve
+from errormotion.measurement.observed import Observed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+T = TypeVar("T")
 UNKNOWNS = 5
 """Origin (3) and the two components of the direction across the beam."""
-_OUTLIER = 6.0
-"""Robust standard deviations from which on a reading is an outlier; outliers are ignored and reported."""
+RADIUS_OF_SPHERE, SCALES = "radius of the sphere", "scales of the positions"
+UNIT = 1e-6
+"""Noise of which that of the residuals is a multiple, m."""
 _MIN_USED = 0.7
 """Smallest share of the readings that must not be outliers."""
 
@@ -46,6 +52,8 @@ class Beam:
         Zero point of the reading, m, and unit vector towards the target.
     covariance : ndarray (6, 6)
         Of (origin, direction), SI; rank 5, since the direction keeps its length.
+    influence : dict of str to ndarray (6,)
+        Effect of one standard uncertainty of each source that all beams have in common; contained in ``covariance``.
     noise : float
         Standard deviation of one reading, from the residuals, m.
     residual : ndarray (profile, step)
@@ -57,9 +65,11 @@ class Beam:
     origin: Array
     direction: Array
     covariance: Array
+    influence: dict[str, Array]
     noise: float
     residual: Array
     left_out: NDArray[np.int64]
+    notes: tuple[str, ...] = ()
 
 
 def sphere_reading(origin: Array, direction: Array, centre: Array, radius: float) -> tuple[Array, Array]:
@@ -79,9 +89,21 @@ def sphere_reading(origin: Array, direction: Array, centre: Array, radius: float
 
 
 def likelihood_fit(
-    distance: Array, centre: Array, radius: float, origin: Array, direction: Array, name: str = "beam"
+    distance: Array,
+    centre: Array,
+    radius: float,
+    origin: Array,
+    direction: Array,
+    name: str = "beam",
+    *,
+    radius_uncertainty: float = 0.0,
+    scale_uncertainty: float = 0.0,
+    middle: Array | None = None,
 ) -> Beam:
     """Fit origin and direction to all readings by least squares on ray and sphere.
+
+    The noise is that of the residuals. Its correlation from step to step of a profile, such as that of the errors of
+    neighbouring positions, is a part of the uncertainty.
 
     Parameters
     ----------
@@ -89,12 +111,16 @@ def likelihood_fit(
         Readings, m; NaN where the beam missed.
     centre : ndarray (profile, step, 3)
         Sphere centres, m.
-    radius : float
-        Sphere radius, m.
+    radius, radius_uncertainty : float
+        Sphere radius and its standard uncertainty, m.
     origin, direction : ndarray (3,)
         Start of the fit: the nominal beam.
     name : str
         Name of the beam in messages.
+    scale_uncertainty : float
+        Relative standard uncertainty of the machine's positions along each axis, about ``middle``.
+    middle : ndarray (3,), optional
+        m; by default the mean of the centres. A common shift of all beams is that of the frame.
 
     Raises
     ------
@@ -110,34 +136,147 @@ def likelihood_fit(
         )
     direction = direction / np.linalg.norm(direction)
     origin, direction = _first_shift(distance, centre, radius, origin, direction, used)
-    valid = used.copy()
-    while True:
-        origin, direction, jacobian = _gauss_newton(distance, centre, radius, origin, direction, used, name)
-        residual = distance - sphere_reading(origin, direction, centre, radius)[0]
-        spread = scale_about_median(residual[used])
-        outlier = used & ~(np.abs(residual) <= max(_OUTLIER * spread, 1e-12))
-        if not outlier.any():
-            break
-        used = used & ~outlier
-        if used.sum() < _MIN_USED * valid.sum():
-            raise MethodError(
-                f"Beam {name}: more than {1 - _MIN_USED:.0%} of the readings do not fit any beam. Check that the "
-                "sphere "
-                "centres belong to the readings."
-            )
-    freedom = int(used.sum()) - UNKNOWNS
-    noise = float(np.sqrt(np.sum(residual[used] ** 2) / freedom))
-    size = np.linalg.norm(jacobian, axis=0)
-    if not size.all() or np.linalg.cond(jacobian / size) > 1e6:
+    about = centre[used].mean(axis=0) if middle is None else middle
+    observed = _observed(
+        np.where(used, distance, np.nan),
+        centre,
+        radius,
+        origin,
+        direction,
+        radius_uncertainty,
+        scale_uncertainty,
+        about,
+    )
+    try:
+        solved = solve(observed)
+    except MethodError as error:
+        if "do not determine" in str(error):
+            raise MethodError(_UNDETERMINED.format(name)) from error
+        if "converge" not in str(error):
+            raise MethodError(f"Beam {name}: {error}") from error
         raise MethodError(
-            f"Beam {name}: the scans do not determine the beam. Expected profiles at two or more distances, "
-            "each along both directions across the beam."
+            f"Beam {name}: the fit does not converge. Check the nominal origin and direction (m, machine coordinates), "
+            f"the sphere radius ({radius * 1e3:g} mm) and that the sphere centres belong to the readings."
+        ) from error
+    kept = np.isfinite(solved.white.problem.readings).reshape(used.shape)
+    if kept.sum() < _MIN_USED * used.sum():
+        raise MethodError(
+            f"Beam {name}: more than {1 - _MIN_USED:.0%} of the readings do not fit any beam. Check that the sphere "
+            "centres belong to the readings."
         )
-    small = noise**2 * np.linalg.inv(jacobian.T @ jacobian)
-    chart = np.zeros((6, UNKNOWNS))
-    chart[:3, :3] = np.eye(3)
-    chart[3:, 3:] = across(direction).T
-    return Beam(origin, direction, chart @ small @ chart.T, noise, residual, np.argwhere(valid & ~used))
+    errors = solved.relative.errors
+    found, along = errors.value[0, :3], errors.value[0, 3:]
+    reading, jacobian = sphere_reading(found, along, centre, radius)
+    J = jacobian[kept & np.isfinite(reading)]
+    size = np.linalg.norm(J, axis=0)
+    if not size.all() or np.linalg.cond(J / size) > 1e6:
+        raise MethodError(_UNDETERMINED.format(name))
+    influence = {source.name: source.effect[0] for source in errors.sources}
+    return Beam(
+        origin=found,
+        direction=along,
+        covariance=errors.covariance[0],
+        influence=influence,
+        noise=UNIT * float(np.sqrt(solved.scatter.factor)),
+        residual=distance - reading,
+        left_out=np.argwhere(used & ~kept),
+        notes=tuple(note for note in solved.observed.notes if "correlated" in note),
+    )
+
+
+_UNDETERMINED = (
+    "Beam {}: the scans do not determine the beam. Expected profiles at two or more distances, each along both "
+    "directions across the beam."
+)
+
+
+class Unknowns(NamedTuple, Generic[T]):
+    """Shift of the origin and two angles of the direction, from their start."""
+
+    beam: T
+
+
+class Known(NamedTuple, Generic[T]):
+    """Radius of the sphere, and the relative errors of the scales of the positions along X, Y and Z."""
+
+    radius: T
+    scale: T
+
+
+def _observed(
+    distance: Array,
+    centre: Array,
+    radius: float,
+    origin: Array,
+    direction: Array,
+    radius_uncertainty: float,
+    scale_uncertainty: float,
+    middle: Array,
+) -> Observed:
+    """Return the readings of one beam as a model."""
+    profiles, steps = distance.shape
+    series, order = np.indices((profiles, steps)).reshape(2, -1)
+    one, basis = np.zeros(distance.size, dtype=np.intp), across(direction)
+    position = np.nan_to_num(centre.reshape(-1, 3))
+
+    def beam(x: Array) -> tuple[Array, Array]:
+        u = direction + x[:, 3:] @ basis
+        return origin + x[:, :3], u / np.linalg.norm(u, axis=1, keepdims=True)
+
+    def equation(y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
+        start, u = beam(x.beam)
+        w = start - middle - (position - middle) * (1 + c.scale)
+        along = np.sum(w * u, axis=1)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(y + along + np.sqrt(along**2 - np.sum(w * w, axis=1) + c.radius[:, 0] ** 2))
+
+    def derivatives(_: Array, x: Unknowns[Array], c: Known[Array]) -> dict[str, Array]:
+        """``dd = -(n . (dP + d du)) / (n . u)`` with ``du = (E - (E . u) u) / |v|``."""
+        v = direction + x.beam[:, 3:] @ basis
+        start, u = beam(x.beam)
+        w = start - middle - (position - middle) * (1 + c.scale)
+        reading = -equation(np.zeros(len(w)), x, c)
+        n = w + reading[:, None] * u
+        across_u = n @ basis.T - np.sum(n * u, axis=1, keepdims=True) * (u @ basis.T)
+        angles = across_u * (reading / np.linalg.norm(v, axis=1))[:, None]
+        return {"beam": (np.concatenate([n, angles], axis=1) / np.sum(n * u, axis=1, keepdims=True))[:, None]}
+
+    return Observed(
+        problem=Problem(
+            equation=equation,
+            derivatives=derivatives,
+            readings=distance.ravel(),
+            unknowns=Unknowns(
+                beam=Block(start=np.zeros((1, UNKNOWNS)), index=one, scale=np.array([radius, radius, radius, 1.0, 1.0]))
+            ),
+            constants=Known(
+                radius=Constant(
+                    value=np.full((1, 1), radius),
+                    factor=np.full((1, 1, int(radius_uncertainty > 0)), radius_uncertainty),
+                    index=one,
+                    scale=radius,
+                    group=RADIUS_OF_SPHERE,
+                ),
+                scale=Constant(
+                    value=np.zeros((1, 3)),
+                    factor=scale_uncertainty * np.eye(3)[None, :, : 3 * int(scale_uncertainty > 0)],
+                    index=one,
+                    scale=1e-3,
+                    group=SCALES,
+                    names=[f"scale of the positions {axis}" for axis in "XYZ"] if scale_uncertainty > 0 else (),
+                ),
+            ),
+            noise=Noise(sd=np.full(distance.size, UNIT), stated=False),
+        ),
+        places=Places(lambda x, _: np.concatenate(beam(x.beam), axis=1), 1),
+        dims=("beam",),
+        coords={"beam": ["beam"]},
+        component="beam",
+        functional_point=(0.0, 0.0, 0.0),
+        reference="",
+        order=order.astype(float),
+        series=series,
+    )
 
 
 def _first_shift(
@@ -152,34 +291,6 @@ def _first_shift(
     lowest_reading = np.mean(distance[seen, lowest[seen]])
     along = (offset @ direction) - radius - lowest_reading
     return origin + sideways + direction * along, direction
-
-
-def _gauss_newton(
-    distance: Array,
-    centre: Array,
-    radius: float,
-    origin: Array,
-    direction: Array,
-    used: NDArray[np.bool_],
-    name: str,
-) -> tuple[Array, Array, Array]:
-    for _ in range(50):
-        model, jacobian = sphere_reading(origin, direction, centre, radius)
-        meets = used & np.isfinite(model)
-        if meets.sum() <= UNKNOWNS:
-            break
-        step, *_ = np.linalg.lstsq(jacobian[meets], (distance - model)[meets])
-        origin = origin + step[:3]
-        direction = turned(direction, np.asarray(step[3:], np.float64))
-        if np.abs(step[:3]).max() < 1e-13 and np.abs(step[3:]).max() < 1e-11:
-            model, jacobian = sphere_reading(origin, direction, centre, radius)
-            if np.isfinite(model[used]).all():
-                return origin, direction, jacobian[used]
-            break
-    raise MethodError(
-        f"Beam {name}: the fit does not converge. Check the nominal origin and direction (m, machine coordinates), the "
-        f"sphere radius ({radius * 1e3:g} mm) and that the sphere centres belong to the readings."
-    )
 
 
 def circles_and_line(

@@ -10,10 +10,17 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.certificates import certified
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
-from errormotion.kinematics.beams import beam_errors
-from errormotion.methods.spindle_drift.identification.beams import Beam, circles_and_line, likelihood_fit
+from errormotion.kinematics.beams import beam_errors, error_jacobian
+from errormotion.methods.spindle_drift.identification.beams import (
+    RADIUS_OF_SPHERE,
+    SCALES,
+    Beam,
+    circles_and_line,
+    likelihood_fit,
+)
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds, segment_steps
 from errormotion.methods.spindle_drift.settings import TrialSettings
 
@@ -46,10 +53,24 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     origin0 = np.asarray(raw["nominal_origin"].transpose("channel", "direction").values, np.float64)
     direction0 = np.asarray(raw["nominal_direction"].transpose("channel", "direction").values, np.float64)
     direction0 = direction0 / np.linalg.norm(direction0, axis=1, keepdims=True)
+    radius_u, scale_u = (
+        float(raw[each]) if each in raw else 0.0 for each in ("sphere_radius_uncertainty", "position_scale_uncertainty")
+    )
+    middle = np.nanmean(centre, axis=(0, 1, 2))
     found: list[Beam] = []
     paper_origin, paper_direction = np.full_like(origin0, np.nan), np.full_like(origin0, np.nan)
     for i, name in enumerate(names):
-        beam = likelihood_fit(distance[i], centre[i], radius, origin0[i], direction0[i], name)
+        beam = likelihood_fit(
+            distance[i],
+            centre[i],
+            radius,
+            origin0[i],
+            direction0[i],
+            name,
+            radius_uncertainty=radius_u,
+            scale_uncertainty=scale_u,
+            middle=middle,
+        )
         found.append(beam)
         if not isinstance(settings, TrialSettings):
             clean = distance[i].copy()
@@ -61,13 +82,18 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         if len(beam.left_out):
             outliers = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
             notes.append(f"{name}: {len(beam.left_out)} readings are outliers and were ignored: {outliers}.")
+        notes += [f"{name}: {note}" for note in beam.notes]
+    directions = np.array([b.direction for b in found])
     errors, covariance = beam_errors(
         origin0,
         direction0,
         np.array([b.origin for b in found]),
-        np.array([b.direction for b in found]),
+        directions,
         np.array([b.covariance for b in found]),
     )
+    sources = list(found[0].influence)
+    chart = error_jacobian(direction0, directions)
+    effects = [np.einsum("bij,bj->bi", chart, np.array([b.influence[one] for b in found])) for one in sources]
     for note in notes:
         log.warning(note)
     parameters = ["px", "py", "pz", "ux", "uy", "uz"]
@@ -110,6 +136,10 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
         measured=measured.attrs,
         start=start_of(measured),
         provenance=provenance.make(settings, measured, None, steps=["ray-sphere likelihood fit", "circles and line"]),
+        influence=np.array(effects) if sources else None,
+        sources=sources or None,
+        source_groups=[RADIUS_OF_SPHERE if one == RADIUS_OF_SPHERE else SCALES for one in sources] or None,
+        source_ids=certified(measured.attrs, {RADIUS_OF_SPHERE: ("sphere", "radius")} if radius_u > 0 else {}),
         extras=extras,
     )
     return ds.assign_attrs(notes=notes or [""])
