@@ -80,6 +80,9 @@ RAW_SCHEMAS = (
             ),
             Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar", required=False),
             Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = unknown", required=False),
+            Row(
+                "bar_radius_uncertainty", (), "m", *NOISE, "standard uncertainty of that radius; else 0", required=False
+            ),
         ),
         sizes={**DIRECTION, "limit": 2},
         labels=XYZ,
@@ -94,6 +97,9 @@ RAW_SCHEMAS = (
             Row("bar_stage", ("bar_reading", "direction"), "m", *POSITION, "position of the stage there"),
             Row("bar_axis", ("direction",), "1", *UNIT_VECTOR, "direction of the bar"),
             Row("bar_radius", (), "m", *RADIUS, "radius of the bar; NaN = unknown", required=False),
+            Row(
+                "bar_radius_uncertainty", (), "m", *NOISE, "standard uncertainty of that radius; else 0", required=False
+            ),
             Row("nominal_direction", ("direction",), "1", *UNIT_VECTOR, "direction of the beam"),
             Row("distance_noise", (), "m", *NOISE, "standard deviation of one reading"),
             Row("nominal_origin", ("direction",), "m", *POSITION, "zero point while the stage is at 0", required=False),

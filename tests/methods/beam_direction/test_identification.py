@@ -385,6 +385,15 @@ def test_simulated_data_have_every_source_drawn_once():
     assert np.mean(np.square(z)) == pytest.approx(1, abs=0.28)
 
 
+def test_the_radius_of_a_bar_is_compared_with_its_uncertainty(machine, calibration):
+    raw = simulation.raw(machine, FOUR, seed=0, check_bar=True)
+    longer = raw.assign(bar_radius=((), machine.check_bar.radius + 20e-6, {"units": "m"}))
+    differs = "It differs by"
+    assert differs in notes(identify(longer, compensation=calibration))
+    uncertain = longer.assign(bar_radius_uncertainty=((), 15e-6, {"units": "m"}))
+    assert differs not in notes(identify(uncertain, compensation=calibration))
+
+
 # Wrong inputs
 
 

@@ -113,6 +113,7 @@ def bar_extras(
         robust=settings.robust,
         extrapolate=settings.extrapolate,
         receiver=settings.receiver,
+        radius_uncertainty=float(raw["bar_radius_uncertainty"]) if "bar_radius_uncertainty" in raw else 0.0,
     )
     points, bar = measure(raw)
     if calibration is not None and bar.systematic:
