@@ -1,0 +1,125 @@
+"""Real readings: every method with readings that are rounded, wrong, drifting or correlated."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+import xarray as xr
+
+from errormotion.errors import MethodError
+from errormotion.plugins import MethodSubject
+from errormotion.testing.results import covariance, truth_at_places, values
+
+TITLE = "Real readings"
+SEEDS = 60
+Z95 = 1.959964
+STEP, OUTLIER, TREND, PHI = 10.0, 300.0, 10.0, 0.8
+"""Step of the scale, size of an outlier and range of a trend, in standard deviations of the noise; correlation."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Simulated data of a method: readings with their noise (SI), and the dims along which they drift or correlate."""
+
+    method: str
+    subject: str
+    readings: str
+    noise: float
+    over_test: str = ""
+    neighbours: str = ""
+
+
+CASES = (
+    Case("linear_positioning", "positioning", "deviation", 0.3e-6, "run", "target"),
+    Case("linear_positioning", "diagonals", "diagonal_deviation", 0.3e-6, "run", "target"),
+    Case("spindle_drift", "drift", "distance", 3e-9, "", "time"),
+    Case("beam_direction", "", "distance", 1e-6),
+    Case("multilateration", "", "displacement", 0.2e-6),
+    Case("normal_vector", "", "touch", 0.25e-6),
+    Case("r_test", "three spheres", "displacement", 0.2e-6, "", "angle"),
+)
+
+
+def section(seeds: int) -> Iterator[str]:
+    """Yield the lines of the section."""
+    yield (
+        f"Intervals of 95 % that hold the truth, where the readings of the conformance kit's simulations are changed: "
+        f"rounded to {STEP:g} times their noise; one reading wrong by {OUTLIER:g} times the noise; a trend over the test "
+        f"of {TREND:g} times the noise; further noise of twice the size with a correlation of {PHI:g} between neighbours. "
+        "Noted: data sets with a note that nominal ones do not have, or that are refused."
+    )
+    yield from ("", "| method | condition | held | noted | refused |", "|---|---|---|---|---|")
+    logging.disable(logging.WARNING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for case in CASES:
+            yield from rows(case, seeds)
+    logging.disable(logging.NOTSET)
+
+
+def rows(case: Case, seeds: int) -> Iterator[str]:
+    """Yield one row for each condition of a method."""
+    subject = next(
+        each
+        for each in import_module(f"errormotion.methods.{case.method}.conformance").subjects()
+        if each.name == case.subject
+    )
+    usual: set[str] = set()
+    for condition in ("nominal", "rounded", "outlier", "trend", "correlated"):
+        if (condition == "trend" and not case.over_test) or (condition == "correlated" and not case.neighbours):
+            continue
+        held, noted, refused = [], 0, 0
+        for seed in range(seeds):
+            raw, truth = subject.make(seed)
+            raw = changed(raw, case, condition, np.random.default_rng([seed, 1]))
+            try:
+                share, notes = outcome(subject, raw, truth)
+            except MethodError:
+                refused += 1
+                continue
+            held.append(share)
+            if condition == "nominal":
+                usual |= notes
+            else:
+                noted += bool(notes - usual)
+        name = " ".join(filter(None, (f"`{case.method}`", case.subject)))
+        inside = f"{np.mean(held):.1%}" if held else "-"
+        says = "" if condition == "nominal" else f"{(noted + refused) / seeds:.0%}"
+        yield f"| {name} | {condition} | {inside} | {says} | {refused / seeds:.0%} |"
+
+
+def outcome(subject: MethodSubject, raw: xr.Dataset, truth: xr.Dataset) -> tuple[float, set[str]]:
+    """Return the share of intervals that hold the truth, and the beginnings of the notes."""
+    errors = subject.identify(raw)
+    off = values(errors) - truth_at_places(errors, truth)
+    u = np.sqrt(np.einsum("pii->pi", covariance(errors)))
+    known = np.isfinite(off) & np.isfinite(u) & ((u > 0) | (off != 0))
+    return float((np.abs(off) <= Z95 * u)[known].mean()), {
+        "".join(c for c in note if not c.isdigit())[:60] for note in errors.em.notes
+    }
+
+
+def changed(raw: xr.Dataset, case: Case, condition: str, rng: np.random.Generator) -> xr.Dataset:
+    """Return raw data with changed readings."""
+    before = raw[case.readings]
+    y = before.values.astype(float).copy()
+    if condition == "rounded":
+        q = STEP * case.noise
+        y = np.round(y / q) * q
+    elif condition == "outlier":
+        y.flat[rng.choice(np.flatnonzero(np.isfinite(y)))] += OUTLIER * case.noise
+    elif condition == "trend":
+        along = np.moveaxis(y, before.dims.index(case.over_test), -1)
+        along += TREND * case.noise * np.linspace(0.0, 1.0, along.shape[-1])
+    elif condition == "correlated":
+        along = np.moveaxis(y, before.dims.index(case.neighbours), 0)
+        e = rng.standard_normal(along.shape)
+        for k in range(1, len(e)):
+            e[k] = PHI * e[k - 1] + np.sqrt(1 - PHI**2) * e[k]
+        along += 2 * case.noise * e
+    return raw.assign({case.readings: (before.dims, y, before.attrs)})
