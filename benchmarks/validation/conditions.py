@@ -48,9 +48,10 @@ CASES = (
 def section(seeds: int) -> Iterator[str]:
     """Yield the lines of the section."""
     yield (
-        f"Intervals of 95 % that hold the truth, where the readings of the conformance kit's simulations are changed: "
-        f"rounded to {STEP:g} times their noise; one reading wrong by {OUTLIER:g} times the noise; a trend over the test "
-        f"of {TREND:g} times the noise; further noise of twice the size with a correlation of {PHI:g} between neighbours. "
+        "Intervals of 95 % that hold the truth, where the readings of the conformance kit's simulations are changed: "
+        f"rounded to {STEP:g} times their noise; one reading wrong by {OUTLIER:g} times the noise; a trend over the "
+        f"test of {TREND:g} times the noise, whose truth is that of its beginning; further noise of twice the size "
+        f"with a correlation of {PHI:g} between neighbours. "
         "Noted: data sets with a note that nominal ones do not have, or that are refused."
     )
     yield from ("", "| method | condition | held | noted | refused |", "|---|---|---|---|---|")

@@ -20,6 +20,7 @@ from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF
@@ -93,7 +94,12 @@ def solve(observed: Observed) -> Solved:
 def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
     """Return what was observed without outliers, with a note on each, the fit, and what was found."""
     if not observed.robust:
-        return observed, fit(observed.problem, refresh=observed.refresh, what=observed.what), None
+        plain = fit(observed.problem, refresh=observed.refresh, what=observed.what)
+        if observed.examined is not None:
+            observed = replace(
+                observed, examined=None, doubts=[*observed.doubts, *_examined(observed, observed.examined)]
+            )
+        return observed, plain, None
     problem, what = observed.problem, observed.what
     if not problem.noise.stated and has_priors(problem):
         # Else a unit of noise would hide what the readings say about the constants.
@@ -132,6 +138,21 @@ def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
         doubts=[*observed.doubts, *doubts],
     )
     return after, last, found
+
+
+def _examined(observed: Observed, problem: Problem) -> list[str]:
+    """Return a sentence on the outliers of readings that are all used."""
+    try:
+        found = cleaned(
+            searchable(observed, problem),
+            suspects=observed.suspects,
+            whole=observed.whole,
+            name=observed.name,
+            what=observed.what,
+        )
+    except FitError:
+        return [f"{observed.what[:1].upper()}{observed.what[1:]} contradict one another; all of them are used."]
+    return exclusions.kept(found, observed.what.removeprefix("the "))
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:

@@ -85,6 +85,9 @@ class Observed:
         See `errormotion.estimation.fit.fit`.
     robust : bool
         Whether outliers among the readings are excluded, with a note, by one rule with its rate of false alarms.
+    examined : Problem, optional
+        Where all readings are used (``robust = False``): the problem in which outliers are searched, to name them in a
+        note that doubts the uncertainties. Its noise should not contain them.
     suspects : callable, optional
         From a fit to what may have happened besides single outliers (`errormotion.estimation.checks.candidates`), which
         is then excluded or estimated as well.
@@ -142,6 +145,7 @@ class Observed:
     correlation: float | None = None
     refresh: Callable[[Problem, Any], Problem] | None = None
     robust: bool = True
+    examined: Problem | None = None
     suspects: Callable[[Fit], Iterable[Candidate]] | None = None
     refuses_contradictions: bool = False
     name: Callable[[Index], str] | None = None
@@ -199,7 +203,7 @@ class Solved:
 def as_expected(observed: Observed) -> Observed:
     """Return a model of expected readings, which say nothing about their noise."""
     step = 0.0 if observed.resolution is None else observed.resolution
-    return replace(observed, noise_increases=False, robust=False, resolution=step, correlation=0.0)
+    return replace(observed, noise_increases=False, robust=False, examined=None, resolution=step, correlation=0.0)
 
 
 class Model(Protocol):

@@ -32,7 +32,7 @@ from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown
 
-__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned", "doubts", "notes"]
+__all__ = ["FALSE_ALARM", "Cleaned", "Exclusion", "cleaned", "doubts", "kept", "notes"]
 
 FALSE_ALARM = 1e-3
 """Probability of excluding anything from valid data."""
@@ -121,6 +121,19 @@ def notes(found: Cleaned, what: str = "readings") -> list[str]:
         done = f"{count} of them {'is' if count == 1 else 'are'} not used" if count else "their effect is estimated"
         texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {done}.")
     return texts
+
+
+def kept(found: Cleaned, what: str = "readings") -> list[str]:
+    """Return a sentence on outliers that are used nevertheless, since the result is that of all readings."""
+    listed = [*found.made, *found.undecided]
+    if not listed:
+        return []
+    words = [each.words + "".join(f" or {other}" for other in each.rivals) for each in listed[:SHOWN]]
+    more = f", and {len(listed) - SHOWN} more" if len(listed) > SHOWN else ""
+    return [
+        f"Some {what} contradict the others ({'; '.join(words)}{more}); they are used, since the result is that of all "
+        f"{what}. Correct them, or measure again."
+    ]
 
 
 def doubts(found: Cleaned, what: str = "readings") -> list[str]:

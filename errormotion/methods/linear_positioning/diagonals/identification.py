@@ -79,7 +79,9 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
         axis="",
         attrs=raw.attrs,
     )
-    return Evaluated(readings, model.spreads_of(readings, settings, "Diagonal "), notes)
+    trends = model.trends_of(readings)
+    notes += model.trend_notes(readings, trends)
+    return Evaluated(readings, model.spreads_of(readings, settings, "Diagonal "), notes, trends, settings.cycle)
 
 
 def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
@@ -99,6 +101,7 @@ def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observ
         readings,
         model.problem_of(readings, evaluated.spreads),
         readings.names,
+        evaluated.trends,
         places=Places(
             lambda x, _: (x.target[np.arange(line.size), line] + known)[:, None], line.size, rows={"target": stop}
         ),

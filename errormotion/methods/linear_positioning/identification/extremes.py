@@ -44,7 +44,15 @@ def _measured_approach(mean: Array) -> Array:
 
 
 def figures(
-    x: Array, z: Array, spread: Scatter, shared: Array, target_u: float, *, straight: bool, trials: int
+    x: Array,
+    z: Array,
+    spread: Scatter,
+    shared: Array,
+    target_u: float,
+    reversal_u: Array,
+    *,
+    straight: bool,
+    trials: int,
 ) -> Extremes:
     """Return the figures of readings in the order of ``standard.FIGURES`` with their bias and uncertainty; m or rad.
 
@@ -59,6 +67,8 @@ def figures(
         Effect of one standard uncertainty of each source that approaches and runs share, without drift.
     target_u : float
         Standard uncertainty that is independent from target to target.
+    reversal_u : ndarray, (target,)
+        Standard uncertainty of the reversal by a trend, one source.
     straight : bool
         Whether the freedom is a straightness, of which a line is removed.
     trials : int
@@ -68,15 +78,14 @@ def figures(
     value = _evaluate(observed, z, straight)
     if not trials:
         return Extremes(value, *np.full((2, value.size), np.nan))
-    true = _trials(x, z, observed, spread, shared, target_u, trials)
+    true = _trials(x, z, observed, spread, shared, target_u, reversal_u, trials)
     found = by_true_values(value, _evaluate(true, z, straight))
     mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
     if not np.isfinite(value[mean]):
         return found
     others = np.arange(value.size) != mean
-    return replace(
-        found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, _mean_reversal_u(x, z, spread))
-    )
+    of_mean = np.hypot(_mean_reversal_u(x, z, spread), reversal_u.mean())
+    return replace(found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, of_mean))
 
 
 def _mean_reversal_u(x: Array, z: Array, spread: Scatter) -> float:
@@ -94,7 +103,14 @@ def _evaluate(statistics: Statistics, z: Array, straight: bool) -> Array:
 
 
 def _trials(
-    x: Array, z: Array, observed: Statistics, spread: Scatter, shared: Array, target_u: float, trials: int
+    x: Array,
+    z: Array,
+    observed: Statistics,
+    spread: Scatter,
+    shared: Array,
+    target_u: float,
+    reversal_u: Array,
+    trials: int,
 ) -> Statistics:
     """Return draws of the true means and standard deviations, (trial, approach, target)."""
     generator = np.random.default_rng(SEED)
@@ -125,6 +141,8 @@ def _trials(
     ]
     of_sources = draw((trials, len(shared))) @ shared + target_u * draw((trials, m))
     drawn[0] += of_sources
+    if both and reversal_u.any():
+        drawn[1] += draw((trials, 1)) * reversal_u / 2.0
     mean = np.full((trials, 2, m), np.nan)
     if both:
         mean[:, 0], mean[:, 1] = drawn[0] + drawn[1], drawn[0] - drawn[1]

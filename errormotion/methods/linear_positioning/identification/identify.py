@@ -10,6 +10,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.series import Trend
 from errormotion.estimation.extremes import Extremes
 from errormotion.kinematics.iso import direction_of, iso_names
 from errormotion.measurement import Datum, Observed, Places
@@ -33,6 +34,8 @@ class Evaluated:
     readings: Readings
     spreads: list[Scatter]
     notes: list[str]
+    trends: list[Trend | None]
+    cycle: str = "linear"
 
     @property
     def steps(self) -> list[str]:
@@ -59,7 +62,8 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
             f"The scatter of {', '.join(names)} differs from target to target, and there are too few runs to state it "
             "for each: where it is smaller than the common one, the common one is used. Measure more runs or targets."
         )
-    return Evaluated(readings, spreads, notes)
+    trends = model.trends_of(readings)
+    return Evaluated(readings, spreads, [*notes, *model.trend_notes(readings, trends)], trends, settings.cycle)
 
 
 def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
@@ -76,6 +80,7 @@ def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observ
         readings,
         model.problem_of(readings, evaluated.spreads),
         names,
+        evaluated.trends,
         places=Places(lambda x, _: x.target[:, :count] + known, position.size),
         datum=_ends(position, known, readings.straight) if readings.straight.any() else None,
         recorded=("deviation", ("run", "approach", "target", "freedom")),
@@ -133,6 +138,7 @@ def _figures(evaluated: Evaluated, solved: Solved, k: int, trials: int, *, align
         evaluated.spreads[k],
         np.nan_to_num(effects).reshape(-1, m),
         float(readings.at_target[k]),
+        model.reversal_by_trend(readings, evaluated.trends, evaluated.cycle)[k],
         straight=bool(readings.straight[k]),
         trials=trials,
     )
@@ -200,11 +206,12 @@ def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str
 
 def reversal_u(evaluated: Evaluated) -> Array:
     """Return the standard uncertainties of the reversal at each target, (line, target)."""
-    rows = []
-    for x, z, spread in zip(evaluated.readings.x, evaluated.readings.z, evaluated.spreads, strict=True):
+    rows, readings = [], evaluated.readings
+    by_trend = model.reversal_by_trend(readings, evaluated.trends, evaluated.cycle)
+    for x, z, spread, more in zip(readings.x, readings.z, evaluated.spreads, by_trend, strict=True):
         n = np.isfinite(x).sum(axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             own = (spread.own_stated / n).sum(axis=0)
             drift = 4.0 * (spread.run_stated[2] + spread.run_stated[3] * z**2) / n.max(axis=0)
-        rows.append(np.sqrt(own + drift))
+        rows.append(np.sqrt(own + drift + np.square(more)))
     return np.array(rows)

@@ -26,6 +26,7 @@ which the standard states without weights, and their true values follow from dra
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -37,11 +38,14 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.datasets.certificates import certified
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.series import SIGNIFICANT, Trend, trend
 from errormotion.estimation.datum import ROUNDING
 from errormotion.estimation.problem import READINGS
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.estimation.sources import Source
 from errormotion.measurement import Block, Constant, Noise, Observed, Problem
 from errormotion.methods.linear_positioning.identification.scatter import EFFECTS, EQUAL, Scatter, scatter
+from errormotion.methods.linear_positioning.schema import APPROACHES
 
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
@@ -49,6 +53,7 @@ if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
 
 T = TypeVar("T")
+TREND = "trend over the test"
 DRIFT, ALIGNMENT, LENGTH, GAIN, EXPANSION, END, NOISE = (
     *("drift from run to run", "alignment", "scale of the lengths", "gain of the instrument", "expansion"),
     *("ends of the reference line", "readings"),
@@ -94,6 +99,47 @@ def spreads_of(readings: Readings, settings: Settings, what: str = "") -> list[S
         except MethodError as error:
             raise MethodError(f"{what}{readings.names[k]}: {error}") from None
     return spreads
+
+
+def trends_of(readings: Readings) -> list[Trend | None]:
+    """Return the trend from run to run of each line, None where there is none that is significant."""
+    found = []
+    for x in readings.corrected:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a target, or a run, without readings
+            offset = np.nanmean(x - np.nanmean(x, axis=1, keepdims=True), axis=(0, 2))
+        of_runs = trend(offset)
+        seen = of_runs is not None and of_runs.probability < SIGNIFICANT / len(readings.names)
+        found.append(of_runs if seen else None)
+    return found
+
+
+def trend_notes(readings: Readings, trends: Sequence[Trend | None]) -> list[str]:
+    """Return a sentence on lines whose readings drift."""
+    sizes = []
+    for name, each in zip(readings.names, trends, strict=True):
+        if each is not None:
+            angle = name[0] == "E" and name[1] in "ABC"
+            sizes.append(f"{name}: {each.range * 1e6:+.3g} {'urad' if angle else 'um'}")
+    if not sizes:
+        return []
+    return [
+        f"The readings drift from the first to the last run ({', '.join(sizes)}): the errors are those in the middle "
+        "of the test, and the drift is a part of their uncertainty. Measure when the machine has warmed up, or faster."
+    ]
+
+
+def reversal_by_trend(readings: Readings, trends: Sequence[Trend | None], cycle: str) -> Array:
+    """Return the standard uncertainties of the reversal by a trend, (line, target).
+
+    A trend of a in each run displaces a backward reading against the forward one by ``a dt`` after the part dt of a
+    run. In a linear cycle dt decreases from 1 at the first target to 0 at the last one, in a pendulum cycle it is 1/2.
+    The unknown course within a run makes it uncertain: as a rectangular distribution of this half width.
+    """
+    m, runs = readings.position.shape[1], readings.x.shape[2]
+    later = 1.0 - np.arange(m) / max(m - 1, 1) if cycle == "linear" else np.full(m, 0.5)
+    ranges = np.array([0.0 if each is None else each.range for each in trends])
+    return np.asarray(np.abs(ranges)[:, None] / max(runs - 1, 1) * later / np.sqrt(3.0))
 
 
 def known_of(readings: Readings) -> Array:
@@ -212,12 +258,15 @@ def _constants(readings: Readings, one: NDArray[np.intp]) -> Known[Constant]:
     )
 
 
-def observed(readings: Readings, problem: Problem, names: Sequence[str], **others: Any) -> Observed:
+def observed(
+    readings: Readings, problem: Problem, names: Sequence[str], trends: Sequence[Trend | None] = (), **others: Any
+) -> Observed:
     """Return readings with what the results of axes and diagonals have in common; ``others`` as for `Observed`.
 
-    Outliers are not excluded, and the reliability of single readings is not stated: the figures of the standard are
-    those of all readings.
+    Outliers are named, but not excluded, and the reliability of single readings is not stated: the figures of the
+    standard are those of all readings.
     """
+    shifts = [None if straight else each for straight, each in zip(readings.straight, trends, strict=bool(trends))]
     return Observed(
         problem=problem,
         frame=str(readings.attrs.get("frame", "machine")),
@@ -225,13 +274,44 @@ def observed(readings: Readings, problem: Problem, names: Sequence[str], **other
         robust=False,
         reliability=False,
         noise_increases=False,
-        finish=partial(_finished, names=names),
+        examined=_examined(readings, problem),
+        name=partial(_name_of, readings),
+        finish=partial(_finished, names=names, trends=shifts),
         **others,
     )
 
 
-def _finished(solved: Solved, names: Sequence[str]) -> Solved:
+def _examined(readings: Readings, problem: Problem) -> Problem:
+    """Return the readings with a noise that outliers do not increase: of each target, at least that of its line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a target without readings
+        scatter = readings.corrected - np.nanmedian(readings.corrected, axis=2, keepdims=True)
+    of_line = np.array([scale_about_zero(one) for one in scatter])
+    of_target = np.array([[scale_about_zero(at) for at in np.moveaxis(one, -1, 0)] for one in scatter])
+    sd = np.fmax(of_target, of_line[:, None])[:, _stops(readings)].T
+    return replace(problem, noise=Noise(sd=np.maximum(sd, EQUAL)))
+
+
+def _stops(readings: Readings) -> NDArray[np.intp]:
+    """Return the target of each reading, in the order of the problem."""
+    return np.tile(readings.order, readings.x.shape[2] * len(readings.approach))
+
+
+def _name_of(readings: Readings, at: NDArray[np.intp]) -> str:
+    """Return the name of a reading (reading, line)."""
+    per_run = len(readings.approach) * len(readings.order)
+    run, rest = divmod(int(at[0]), per_run)
+    way, stop = divmod(rest, len(readings.order))
+    line = int(at[1]) if len(at) > 1 else 0
+    place = 1e3 * readings.position[line, readings.order[stop]]
+    return f"{readings.names[line]} at {place:.6g} mm, {APPROACHES[readings.approach[way]]}, run {run + 1}"
+
+
+def _finished(solved: Solved, names: Sequence[str], trends: Sequence[Trend | None]) -> Solved:
     """Return a solution in which the runs are one source for each of their effects, and rounding is none.
+
+    A trend is a further source: at any instant of the test the errors are those of its middle but for a part of the
+    range, as a rectangular distribution. A straightness is relative to its ends, and has none.
 
     The noise has been estimated from the same readings, and is not compared with them again.
     """
@@ -248,6 +328,12 @@ def _finished(solved: Solved, names: Sequence[str]) -> Solved:
     noise = _fewest([source for source in errors.sources if source.group == NOISE], u)
     kept = [source for source in errors.sources if source.group not in (DRIFT, NOISE)]
     found = [*drift, *kept, *(replace(source, name=f"{NOISE}{_number(i)}") for i, source in enumerate(noise))]
+    for k, each in enumerate(trends):
+        if each is not None:
+            effect = np.where(np.isnan(errors.value), np.nan, 0.0)
+            of_line = effect[:, k] if effect.shape[1] == len(names) else effect.reshape(len(names), -1)[k]
+            of_line += each.range / np.sqrt(12.0)
+            found.append(Source(f"{TREND}, {names[k]}", TREND, effect))
     exact = [replace(source, effect=_without_rounding(source.effect)) for source in found]
     relative = replace(solved.relative, errors=replace(errors, sources=exact))
     return replace(solved, relative=relative, scatter=replace(solved.scatter, note=""))
