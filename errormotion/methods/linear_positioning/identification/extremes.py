@@ -49,7 +49,7 @@ def figures(
     spread: Scatter,
     shared: Array,
     target_u: float,
-    reversal_u: Array,
+    reversal_u: Array | None = None,
     *,
     straight: bool,
     trials: int,
@@ -67,13 +67,14 @@ def figures(
         Effect of one standard uncertainty of each source that approaches and runs share, without drift.
     target_u : float
         Standard uncertainty that is independent from target to target.
-    reversal_u : ndarray, (target,)
-        Standard uncertainty of the reversal by a trend, one source.
+    reversal_u : ndarray, (target,), optional
+        Standard uncertainty of the reversal by a trend, one source; 0 by default.
     straight : bool
         Whether the freedom is a straightness, of which a line is removed.
     trials : int
         0: bias and uncertainty are not determined (NaN).
     """
+    reversal_u = np.zeros(z.size) if reversal_u is None else reversal_u
     observed = standard.statistics(x)
     value = _evaluate(observed, z, straight)
     if not trials:
