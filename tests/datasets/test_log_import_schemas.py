@@ -10,8 +10,10 @@ import xarray as xr
 from errormotion import datasets, plugins
 from errormotion.datasets.importing import import_log
 from errormotion.datasets.schemas import RawSchema, Row, raw_schemas
+from errormotion.errors import PluginWarning
+from errormotion.plugins import MethodInfo
 
-BALLBAR = Path(__file__).parents[2] / "examples" / "ballbar_distribution"
+FOREIGN = Path(__file__).parents[2] / "examples" / "reference_touches"
 FREE = 3
 """Length of a dimension without a length in the schema."""
 SECOND = {"direction_": "direction", "p_": "p"}
@@ -19,11 +21,10 @@ SECOND = {"direction_": "direction", "p_": "p"}
 
 def foreign() -> tuple[RawSchema, ...]:
     """Return the raw schemas of the method in a separate distribution."""
-    path = BALLBAR / "ballbar_test" / "schema.py"
-    spec = importlib.util.spec_from_file_location("ballbar_schema", path)
+    spec = importlib.util.spec_from_file_location("foreign_method", FOREIGN / "reference_touches.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.RAW_SCHEMAS
+    return module.ReferenceTouches.raw_schemas
 
 
 TABLES = (*raw_schemas(), *foreign())
@@ -97,8 +98,7 @@ def log_and_map(raw: xr.Dataset, table: RawSchema) -> tuple[str, str]:
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.title)
 def test_a_log_of_any_raw_schema_is_imported(table: RawSchema, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if table in foreign():
-        owner = type("Foreign", (), {"raw_schemas": foreign()})
-        monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: owner)
+        monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: Foreign)
     raw = content(table, np.random.default_rng(7))
     assert datasets.violations(raw) == []
     log, mapping = log_and_map(raw, table)
@@ -111,16 +111,57 @@ def test_a_log_of_any_raw_schema_is_imported(table: RawSchema, tmp_path: Path, m
         assert found[row.name].attrs == raw[row.name].attrs
 
 
-def test_the_log_of_a_ballbar_is_imported_with_the_map_of_its_distribution(
+def test_the_log_of_a_foreign_method_is_imported_with_the_map_of_its_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: type("Foreign", (), {"raw_schemas": foreign()}))
+    monkeypatch.setattr(plugins, "owner_of_schema", lambda schema: Foreign)
+    lines = ["Time,Repeat,X,Y,Z,T"]
+    lines += [f"{time},1,100,200.5,{300 + time * 1e-3},20.5" for time in (0, 60, 120)]
+    (tmp_path / "log.txt").write_text("\n".join(lines) + "\n")
+    raw = import_log(tmp_path / "log.txt", FOREIGN / "import.toml", tmp_path / "raw.nc")
+    assert datasets.violations(raw) == []
+    assert raw["touch"].sel(direction="y").values == pytest.approx(np.full((3, 1), 0.2005))
+    assert raw["touch"].sel(direction="z").values[:, 0] == pytest.approx([0.3, 0.30006, 0.30012])
+
+
+def test_the_log_of_a_ballbar_is_imported_by_its_former_name(tmp_path: Path) -> None:
+    """The map of version 0.1 still works."""
     lines = ["direction\tcircle\tlength\tangle\ttime\tT"]
     for run, way in enumerate(("CCW", "CW"), 1):
         lines += [f"{way}\t1\t{150 + run * 1e-3}\t{angle}\t{60 * run + angle}\t20.5" for angle in (0, 90, 180)]
     (tmp_path / "log.txt").write_text("\n".join(lines) + "\n")
-    raw = import_log(tmp_path / "log.txt", BALLBAR / "import.toml", tmp_path / "raw.nc")
+    (tmp_path / "map.toml").write_text(MAP)
+    plugins.refresh()
+    with pytest.warns(PluginWarning, match="'ballbar' is called 'circular_test' now"):
+        raw = import_log(tmp_path / "log.txt", tmp_path / "map.toml", tmp_path / "raw.nc")
     assert datasets.violations(raw) == []
     assert raw["length"].dims == ("direction_of_travel", "run", "sample")
     np.testing.assert_allclose(raw["length"].sel(direction_of_travel="CW"), np.full((1, 3), 0.150002), rtol=1e-12)
     np.testing.assert_allclose(raw["angle"][0, 0], [0, np.pi / 2, np.pi], rtol=1e-12)
+
+
+MAP = """
+schema = "errormotion.raw.ballbar/1"
+machine = "machining centre 7"
+labels = {direction_of_travel = "direction", run = "circle"}
+
+[columns]
+length = {column = "length", unit = "mm"}
+angle = {column = "angle", unit = "deg"}
+reading_time = {column = "time", unit = "s"}
+temperature = {column = "T", unit = "degC"}
+
+[values]
+nominal_radius = "150 mm"
+feed = "1000 mm/min"
+centre = ["0 mm", "0 mm", "0 mm"]
+axis_direction = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+length_uncertainty = "0.5 um"
+"""
+
+
+class Foreign:
+    """A method that is not installed."""
+
+    info = MethodInfo("reference_touches", "", "simulated_only")
+    raw_schemas = foreign()

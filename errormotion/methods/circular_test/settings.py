@@ -1,4 +1,6 @@
-"""Settings of the method."""
+"""Settings of the method: the test to plan or to simulate, and the evaluation."""
+
+from __future__ import annotations
 
 import math
 from typing import Literal
@@ -12,7 +14,7 @@ DEGREE = math.pi / 180
 
 
 class Settings(PluginSettings):
-    """Settings of ``ballbar``: the test to plan or to simulate, and the evaluation."""
+    """The test to plan or to simulate, the evaluation, and the limits of the figures."""
 
     # The test
     plane: Literal["XY", "YZ", "ZX"] = Field(
