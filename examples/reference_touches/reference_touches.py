@@ -134,8 +134,9 @@ class ReferenceTouches(ModelMethod):
             for k, name in enumerate(("EX", "EY", "EZ"))
         ]
 
-    def conformance(self) -> tuple[MethodSubject, ...]:
+    @classmethod
+    def conformance(cls) -> tuple[MethodSubject, ...]:
         """Return the subject of the kit, whose axes are those of the machine."""
         still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        simulated = partial(self.simulate, Settings())
-        return (MethodSubject(ReferenceTouches, simulated, raw_vectors={}, measured=("touch",), motion=still),)
+        simulated = partial(cls().simulate, Settings())
+        return (MethodSubject(cls, simulated, raw_vectors={}, measured=("touch",), motion=still),)

@@ -8,7 +8,7 @@ from errormotion.testing import MethodConformance
 
 
 class TestReferenceTouches(MethodConformance):
-    subject = ReferenceTouches().conformance()[0]
+    subject = ReferenceTouches.conformance()[0]
 
 
 def test_a_machine_that_shows_less_at_the_reference_is_too_far() -> None:
