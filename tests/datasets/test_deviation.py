@@ -39,7 +39,7 @@ def radial(**changes: Any) -> xr.Dataset:
         "frame": "machine",
         "functional_point": (0.1, 0.2, 0.3),
         "reference": "nominal circle",
-        "method": "ballbar",
+        "method": "bar",
         "method_version": "1",
         "provenance": {},
     }
