@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 from errormotion import plugins
+from errormotion.campaign.files import load_campaign
 from errormotion.errors import MethodError, PluginWarning
 from errormotion.measurement.drawing import simulate
 from errormotion.methods.circular_test import CircularTest, Settings, figures, path
@@ -246,3 +247,17 @@ def test_the_former_name_is_that_of_this_method():
     assert [each.name for each in CircularTest.figures(found.assign_attrs(method="ballbar"))] == [
         f"{n} XY" for n in NAMES
     ]
+
+
+def test_a_campaign_that_names_the_former_method_is_planned(tmp_path):
+    (tmp_path / "bench.toml").write_text('schema = "errormotion.bench/1"\nname = "Circular tests"\nmachine = "mc 7"\n')
+    (tmp_path / "campaign.toml").write_text(
+        'schema = "errormotion.campaign/1"\nname = "Circular test"\nbench = "bench.toml"\n\n'
+        '[[test]]\nname = "circle-XY"\nmethod = "ballbar"\nsettings = {nominal_radius = "150 mm", places = 60}\n'
+    )
+    plugins.refresh()
+    with pytest.warns(PluginWarning, match="The method 'ballbar' is called 'circular_test' now"):
+        (test,) = load_campaign(tmp_path / "campaign.toml").tests
+    assert test.method is CircularTest
+    # 2 x 0.5 um of the bar, and little else
+    assert 1.0 < 2e6 * float(np.sqrt(CircularTest().plan(test.settings)["deviation_variance"].mean())) < 1.5
