@@ -134,6 +134,8 @@ class CircularTest(ModelMethod):
             limit = limits.get(LIMITS[1] if name == "H" else LIMITS[0] if name[0] == "G" else "")
             effect = None if effects is None else dict(zip(sources, effects[:, k].tolist(), strict=True))
             value = float(errors["figures"][k])
+            if name == "D":  # follows from the errors alone
+                value, U, effect = *_mean(errors), None
             found.append(FigureOfMerit(f"{name} {errors.attrs['plane']}", value, U, "m", limit, effect))
         return found
 
@@ -193,6 +195,19 @@ def _finished(solved: Solved, *, circles: Circles, sectors: Sectors, settings: A
     extras["offset"] = extras["offset"].assign_coords(axis=list(circles.plane))
     notes = [*observed.notes, *_remarks(relative.coefficient, misfit, circles.radius)]
     return replace(solved, observed=replace(observed, extras={**observed.extras, **extras}, notes=notes))
+
+
+def _mean(errors: xr.Dataset) -> tuple[float, float]:
+    """Return the radius of the least-squares circle of the deviations, and its expanded uncertainty, m."""
+    over = ("direction_of_travel", "angle")
+    deviation = errors["deviation"].transpose(*over).values.ravel()
+    known, angle = np.isfinite(deviation), np.tile(errors["angle"].values, 2)
+    circle = np.stack([np.ones(angle.size), np.cos(angle), np.sin(angle)], axis=1)
+    h = np.linalg.pinv(circle[known])[0]
+    effect = errors["deviation_influence"].transpose("source", *over).values.reshape(-1, angle.size)[:, known]
+    own = errors["deviation_variance"].transpose(*over).values.ravel()[known] - np.square(effect).sum(axis=0)
+    variance = np.square(effect @ h).sum() + np.square(h) @ np.maximum(own, 0.0)
+    return float(h @ deviation[known]), 2 * float(np.sqrt(variance))
 
 
 def _array(dims: Any, values: Any, unit: str, meaning: str) -> xr.DataArray:
