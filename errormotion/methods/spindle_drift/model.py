@@ -38,6 +38,7 @@ from errormotion.methods.spindle_drift.identification.record import (
     reference_windows,
     run_out_at_rest,
     settling,
+    without_spikes,
 )
 from errormotion.methods.spindle_drift.identification.setup import Setup
 from errormotion.methods.spindle_drift.result import REFERENCE, Result
@@ -211,7 +212,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
-    record = average_record(raw, settings)
+    record = without_spikes(average_record(raw, settings), notes)
     raw = raw.drop_vars("distance").sel(channel=list(CHANNELS))
     averages = record.averages
     time = averages.time
@@ -294,7 +295,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         shared=REFERENCE,
         what="the readings of the bar",
         robust=False,  # as many readings as unknowns: nothing checks them
-        resolution=0.0,  # means of samples; that of single readings is in their stated noise
+        resolution=0.0,  # of means; rounded samples are part of their noise
         finish=result.finish,
         attributes={"reference_interval": result.interval},
         attrs={"reference_time": result.zero, "beams": settings.beams},

@@ -12,7 +12,7 @@ from errormotion.kinematics.iso import DOF
 from errormotion.methods.spindle_drift.acquisition.motions import machine_axes
 from errormotion.methods.spindle_drift.identification.beams import fisher_bound, sphere_reading
 from errormotion.methods.spindle_drift.identification.detection import identify_beams
-from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
+from errormotion.methods.spindle_drift.schema import CHANNELS, PLANNED, SCHEMA
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import Settings
@@ -133,4 +133,4 @@ def _centres(origin: Array, direction: Array, settings: Settings) -> Array:
 
 
 _LABELS = {"channel": list(CHANNELS), "direction": list("xyz"), "height": ["L1", "L2"]}
-_ATTRS = {"schema": SCHEMA, "machine": "plan"}
+_ATTRS = {"schema": SCHEMA, "machine": PLANNED}

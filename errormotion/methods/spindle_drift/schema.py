@@ -16,6 +16,8 @@ from errormotion.datasets.schemas import (
 SCHEMA = "errormotion.raw.spindle_drift/1"
 """Id of all raw schemas of the method."""
 
+PLANNED = "plan"
+"""The machine of expected readings."""
 CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 """Channels of the five-sensor frame."""
 

@@ -20,6 +20,8 @@ from errormotion.arrays import Array
 from errormotion.datasets.files.hashing import DatasetHasher, cores
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.resolution import common, noise_before, step_of
+from errormotion.estimation.checks.series import spikes
 from errormotion.methods.spindle_drift.identification.averaging import (
     Averager,
     Averages,
@@ -30,7 +32,7 @@ from errormotion.methods.spindle_drift.identification.averaging import (
     window_sums,
 )
 from errormotion.methods.spindle_drift.identification.times import Times, first_and_last, increases, values_of
-from errormotion.methods.spindle_drift.schema import CHANNELS
+from errormotion.methods.spindle_drift.schema import CHANNELS, PLANNED
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +44,12 @@ _CHANCE = 3.3
 """Standard deviations by which the observed noise must exceed the stated one (about one record in a thousand)."""
 _EDGE = 0.01
 """Share of a mean by which its edges may be off, because the interval of the samples does not divide its length."""
+_FIRST = 20_000
+"""Readings of a channel that show the step of its scale."""
+_NOTICEABLE = 0.14
+"""Rounding in units of the noise of a mean from which it adds 1 %."""
+_SHOWN = 6
+"""Times in a note."""
 _ENOUGH = 30
 """Smallest number of values for a standard deviation."""
 _SAME_SPEED = 0.02
@@ -66,6 +74,8 @@ class Record:
     scatter : ndarray (5,) or None
         Standard deviation of single readings within one mean at steady speed, m; None where the record consists of
         means, or has no spindle speed.
+    step : ndarray (5,)
+        Of the scale that the readings are rounded to, m; 0 for none.
     hash : str
         Of the raw data, from the same pass.
     """
@@ -75,6 +85,7 @@ class Record:
     spindle_speed: Array | None
     scatter: Array | None
     weight: Array
+    step: Array
     hash: str
 
 
@@ -88,9 +99,12 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     parts: list[Averages] = []
     slow_parts: dict[str, list[Averages]] = {name: [] for name in slow}
     scatter: Array | None = None
+    step: Array | None = None
     with DatasetHasher(raw) as hasher:
         for piece in _pieces(raw, {"distance": averager, **slow_averagers}, order, hasher):
             parts.append(piece.added_to(averager, "distance"))
+            if step is None and raw.attrs.get("machine") != PLANNED:  # expected readings have no noise
+                step = np.array([step_of(row[:_FIRST]) for row in piece.values["distance"]])
             for name in slow:
                 slow_parts[name].append(piece.added_to(slow_averagers[name], name))
             if "spindle_speed" in slow and scatter is None:
@@ -102,8 +116,33 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     speed = means.get("spindle_speed")
     averages = join(parts)
     ones = np.ones(averages.mean.shape)
-    record = Record(averages, means.get("temperature"), None if speed is None else speed[0], scatter, ones, known_hash)
+    record = Record(
+        averages=averages,
+        temperature=means.get("temperature"),
+        spindle_speed=None if speed is None else speed[0],
+        scatter=scatter,
+        weight=ones,
+        step=np.zeros(len(CHANNELS)) if step is None else step,
+        hash=known_hash,
+    )
     return _at_common_times(record, settings)
+
+
+def without_spikes(record: Record, notes: list[str]) -> Record:
+    """Return a record without the means that stand out from those beside them, which are noted.
+
+    As many readings as unknowns check nothing: a wrong reading is found by its neighbours in time only.
+    """
+    mean = record.averages.mean.copy()
+    for channel, row in zip(CHANNELS, mean, strict=True):
+        wrong = spikes(row)
+        if wrong.any():
+            at = ", ".join(f"{time:.1f} s" for time in record.averages.time[wrong][:_SHOWN])
+            notes.append(
+                f"{channel}: {int(wrong.sum())} means stand out from those beside them and are not used ({at})."
+            )
+            row[wrong] = np.nan
+    return replace(record, averages=replace(record.averages, mean=mean))
 
 
 def _at_common_times(record: Record, settings: Settings) -> Record:
@@ -281,7 +320,7 @@ def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str])
     averages = record.averages
     sigma = stated / np.sqrt(np.maximum(averages.count, 1))
     if settings.noise == "stated":
-        return np.asarray(sigma * record.weight)
+        return _rounded(np.asarray(sigma * record.weight), record, notes)
     for i, channel in enumerate(CHANNELS):
         # Second differences remove the drift, the median removes steps.
         root = np.sqrt(np.maximum(averages.count[i], 1))
@@ -297,7 +336,28 @@ def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str])
                 f"{stated * 1e6:.3g} um; the uncertainty follows from the observed noise."
             )
             sigma[i] = seen / root
-    return np.asarray(sigma * record.weight)
+    return _rounded(np.asarray(sigma * record.weight), record, notes)
+
+
+def _rounded(sigma: Array, record: Record, notes: list[str]) -> Array:
+    """Return the uncertainties of means with that of rounding, which all readings of a mean may have in common."""
+    found, noted = sigma.copy(), []
+    for i, (channel, step) in enumerate(zip(CHANNELS, record.step, strict=True)):
+        if not step > 0:
+            continue
+        before = noise_before(
+            float(step), float(np.median(sigma[i] * np.sqrt(np.maximum(record.averages.count[i], 1))))
+        )
+        b = float(common(float(step), before))
+        if b > _NOTICEABLE * np.median(sigma[i]):
+            noted.append(f"{channel} by {step * 1e6:.3g} um")
+            found[i] = np.hypot(sigma[i], b)
+    if noted:
+        notes.append(
+            f"The readings are rounded ({', '.join(noted)}), with less noise than that: rounding is a part of the "
+            "uncertainties."
+        )
+    return found
 
 
 def sensors(raw: xr.Dataset) -> list[str]:

@@ -1,0 +1,52 @@
+"""Drifts with rounded readings, or with a wrong one: the intervals hold the truth, and a note says why."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from errormotion.kinematics.iso import DOF
+from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.methods.spindle_drift.simulation import simulate
+
+SETTINGS = Settings(functional_point=(0.0, 0.0, 0.0))
+MEASURED = Settings(duration=6000.0)
+NOISE = 3e-9
+
+
+def held(raw: xr.Dataset, truth: xr.Dataset) -> tuple[float, xr.Dataset]:
+    """Return the share of intervals that hold the truth, and the result."""
+    errors = SpindleDrift().identify(raw, SETTINGS)
+    true = truth.interp(time=errors["time"].values)
+    inside = []
+    for k, name in enumerate(DOF[:5]):
+        off = (errors[name].values - true[name].values)[1:]
+        u = np.sqrt(errors["covariance"].values[1:, k, k])
+        known = np.isfinite(off)
+        inside.append(np.abs(off[known]) <= 1.96 * u[known])
+    return float(np.mean(np.concatenate(inside))), errors
+
+
+@pytest.mark.parametrize("step", [0.0, 0.1e-6])
+def test_rounded_readings(step: float) -> None:
+    found = []
+    for seed in range(4):
+        raw, truth = simulate(MEASURED, seed)
+        if step:
+            raw["distance"] = (raw["distance"] / step).round() * step
+        share, errors = held(raw, truth)
+        found.append(share)
+        assert any("readings are rounded (X1 by 0.1 um" in note for note in errors.em.notes) == (step > 0)
+    assert np.mean(found) > 0.9
+
+
+def test_a_wrong_mean_is_left_out_and_named() -> None:
+    raw, truth = simulate(MEASURED, 1)
+    raw = raw.transpose("channel", "time", ...)
+    raw["distance"][2, 50] += 300 * NOISE
+    _, errors = held(raw, truth)
+    channel = str(raw["channel"].values[2])
+    assert any(f"{channel}: 1 means stand out" in note for note in errors.em.notes)
+    known = np.isfinite(errors["EX"].values)
+    assert (~known).sum() == 1
+    plain = SpindleDrift().identify(simulate(MEASURED, 1)[0], SETTINGS)
+    assert errors["EX"].values[known] == pytest.approx(plain["EX"].values[known], abs=1e-9)
