@@ -58,6 +58,7 @@ class RTest(ModelMethod):
             "errors of the linear axes, which follow the spheres: they count as errors of the rotary axis",
             "rotations, if there is one sphere only",
             "an angle of all readings that is shifted by the same amount",
+            "a slow drift of the spheres or of the nest during the test, which looks like an error motion",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA)
