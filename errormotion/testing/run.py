@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
@@ -95,6 +95,12 @@ def checks_for(subject: Subject) -> Sequence[Check[Any]]:
     return METHOD_CHECKS
 
 
+def _maker(cls: Any) -> Callable[[], Any]:
+    """Return the function that makes the subjects, a static one or that of an instance."""
+    found: Callable[[], Any] = (cls() if issubclass(cls, plugins.Method) else cls).conformance
+    return found
+
+
 def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> Sequence[Subject]:
     """Return the subjects of one plugin.
 
@@ -109,8 +115,8 @@ def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> 
     """
     cls = plugins.get(group, plugin_id)
     subjects: tuple[Any, ...] = ()
-    if hasattr(cls, "conformance"):
-        stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else cls.conformance()
+    if plugins.states(cls, "conformance") if group == "methods" else hasattr(cls, "conformance"):
+        stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else _maker(cls)()
         subjects = stated if isinstance(stated, tuple) else (stated,)
         if not all(isinstance(subject, Subject) for subject in subjects):
             raise PluginError(f"The attribute conformance of '{plugin_id}': expected {_EXPECTED.get(group, 'subject')}")

@@ -6,7 +6,7 @@ import pytest
 
 from errormotion import plugins
 from errormotion.errors import PluginError
-from errormotion.plugins import InstrumentInfo, MethodInfo
+from errormotion.plugins import InstrumentInfo, Method, MethodInfo, MethodSubject
 from errormotion.testing import InstrumentSubject, check_plugin, run_checks
 from errormotion.testing.run import subjects_of
 
@@ -67,6 +67,21 @@ def test_a_method_without_subjects_is_reported_with_a_remedy(registered):
     registered(info=MethodInfo("mine", "", "simulated_only"))
     with pytest.raises(PluginError, match="conformance = 'module:name'"):
         subjects_of("methods", "mine")
+
+
+def test_a_method_with_the_base_class_may_state_no_subject_or_a_method_that_makes_them(monkeypatch):
+    class Bare(Method):
+        info = MethodInfo("mine", "", "simulated_only")
+
+    class Own(Bare):
+        def conformance(self):
+            return (MethodSubject(type(self), None, {}),)
+
+    monkeypatch.setattr(plugins, "get", lambda group, plugin_id: Bare)
+    with pytest.raises(PluginError, match="conformance = 'module:name'"):
+        subjects_of("methods", "mine")
+    monkeypatch.setattr(plugins, "get", lambda group, plugin_id: Own)
+    assert [subject.plugin for subject in subjects_of("methods", "mine")] == [Own]
 
 
 def test_an_instrument_without_simulator_needs_an_address(registered):
