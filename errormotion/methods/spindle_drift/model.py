@@ -212,7 +212,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
-    record = without_spikes(average_record(raw, settings), notes)
+    record = without_spikes(average_record(raw, settings), settings, notes)
     raw = raw.drop_vars("distance").sel(channel=list(CHANNELS))
     averages = record.averages
     time = averages.time

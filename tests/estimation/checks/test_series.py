@@ -53,3 +53,12 @@ def test_trends_are_significant_as_often_as_stated() -> None:
     share = np.mean([each is not None and each.significant for each in found])
     assert abs(share - SIGNIFICANT) < 4 * np.sqrt(SIGNIFICANT / 4000)
     assert trend(np.array([1.0, 2.0, np.nan, 3.0])) is None
+
+
+def test_a_value_beside_a_missing_one_is_not_compared_across_it() -> None:
+    """A change during an interruption would look like a spike of the last value before it."""
+    y = 5e-9 * np.random.default_rng(5).standard_normal(T.size)
+    y[100] = np.nan
+    y[101:] += 3e-6
+    y[99] += 1.5e-6
+    assert not spikes(y)[[99, 101]].any()

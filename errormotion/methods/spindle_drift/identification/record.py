@@ -128,14 +128,20 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     return _at_common_times(record, settings)
 
 
-def without_spikes(record: Record, notes: list[str]) -> Record:
+def without_spikes(record: Record, settings: Settings, notes: list[str]) -> Record:
     """Return a record without the means that stand out from those beside them, which are noted.
 
-    As many readings as unknowns check nothing: a wrong reading is found by its neighbours in time only.
+    As many readings as unknowns check nothing: a wrong reading is found by its neighbours in time only. What changes
+    at once by a command (speed, compensation) is no spike, however short.
     """
+    time = record.averages.time
+    near = settling(record, settings.spin_up)
+    for event in settings.schedule:
+        near |= np.abs(time - event.at - SWITCHING / 2) < settings.average + SWITCHING / 2
+    near = near | np.append(near[1:], False) | np.append(False, near[:-1])
     mean = record.averages.mean.copy()
     for channel, row in zip(CHANNELS, mean, strict=True):
-        wrong = spikes(row)
+        wrong = spikes(np.where(near, np.nan, row))
         if wrong.any():
             at = ", ".join(f"{time:.1f} s" for time in record.averages.time[wrong][:_SHOWN])
             notes.append(
