@@ -52,7 +52,8 @@ def section(seeds: int) -> Iterator[str]:
         f"rounded to {STEP:g} times their noise; one reading wrong by {OUTLIER:g} times the noise; a trend over the "
         f"test of {TREND:g} times the noise, whose truth is that of its beginning; further noise of twice the size "
         f"with a correlation of {PHI:g} between neighbours. "
-        "Noted: data sets with a note that nominal ones do not have, or that are refused."
+        "Noted: data sets with a note that nominal ones do not have, or that are refused. The values of one data set "
+        f"share sources, so that a share has a standard deviation of up to {np.sqrt(0.05 * 0.95 / seeds):.0%}."
     )
     yield from ("", "| method | condition | held | noted | refused |", "|---|---|---|---|---|")
     logging.disable(logging.WARNING)
