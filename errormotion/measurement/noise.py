@@ -257,16 +257,13 @@ def estimated_noise(
     FitError
         The readings have no redundancy.
     """
-    problem, noise, size = found.problem, found.problem.noise, 1.0
+    problem, size = found.problem, 1.0
     for _ in range(_STEPS):
         factor, freedom = noise_variance(found)
         if not factor > 0:
             break
         size *= float(np.sqrt(factor))
-        sd = None if noise.sd is None else np.asarray(noise.sd * size)
-        root = None if noise.root is None else np.asarray(noise.root * size)
-        scaled = replace(problem, noise=replace(noise, sd=sd, root=root))
-        found = fit(scaled, refresh=refresh, what=what, start=found.linear.at)
+        found = fit(scaled(problem, size**2), refresh=refresh, what=what, start=found.linear.at)
         if abs(factor - 1) < _SAME:
             break
     return found, size**2, freedom
