@@ -5,6 +5,7 @@ Each returns one sentence for each violation.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,7 +36,7 @@ def magnitude_violations(name: str, variable: xr.Variable, row: Row) -> list[str
     """Return violations of type, unit and magnitude of the values of a variable, of a sample if it is large."""
     if variable.dtype.kind not in "fiu":
         return [f"{name}: expected numbers (float64); found {_dtype(variable)}"]
-    found = unit_violations(name, variable.attrs, row.unit)
+    found = unit_violations(name, variable.attrs, row.unit) + _of_several(name, variable.attrs, row.units)
     values = sample(variable).astype(float)
     if np.isinf(values).any():
         found.append(f"{name}: expected finite numbers, NaN where unknown; found an infinite one")
@@ -59,6 +60,15 @@ def _guess(value: float, row: Row) -> str:
         if row.low <= value * factor + offset <= row.high:
             return f"; is it in {unit}?"
     return ""
+
+
+def _of_several(name: str, attrs: Mapping[Any, Any], units: tuple[str, ...]) -> list[str]:
+    """Return a sentence if a stated unit is none of those of a variable of several quantities, such as m and rad."""
+    stated = attrs.get("units")
+    if not units or stated is None or set(re.findall(r"[^\s,;]+", str(stated))) <= {*units, "and", "or"}:
+        return []
+    expected = " or ".join(f"'{unit}'" for unit in units)
+    return [f"{name}: expected units {expected}; found '{stated}'. Convert the values and set the attribute"]
 
 
 def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from errormotion.errors import DatasetError
 from errormotion.methods.linear_positioning import LinearPositioning
 from errormotion.methods.linear_positioning.settings import Settings
 from errormotion.tolerances.conformity import judge
@@ -74,3 +75,13 @@ def test_coarse_readings_do_not_agree_to_nothing(step: float) -> None:
         assert (u > 0.1e-6).all()
         inside.append(np.abs((errors["EX"] - truth["EX"]).values) <= 1.96 * u)
     assert np.mean(inside) > 0.9
+
+
+def test_a_unit_that_is_not_si_is_refused_although_lengths_and_angles_share_a_variable() -> None:
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    for accepted in ("m", "m, rad"):
+        raw["deviation"].attrs["units"] = accepted
+        METHOD.identify(raw, SETTINGS)
+    raw["deviation"].attrs["units"] = "mm"
+    with pytest.raises(DatasetError, match="deviation: expected units 'm' or 'rad'; found 'mm'"):
+        METHOD.identify(raw, SETTINGS)
