@@ -39,7 +39,7 @@ def part(source: Source, key: str) -> Part:
     sections = [
         Section("direction", "Direction and origin", _direction(beam, source.errors, key)),
         Section("planes", "Planes and residuals", planes_section.blocks(beam.planes, f"{key}-residual")),
-        Section("compensation", "Compensation of the inclination error", _compensation(beam, source.errors, key)),
+        Section("compensation", "Compensation of the inclination error", _compensation(beam, key)),
         Section(
             "surface",
             "Inclination error of the sensor",
@@ -238,7 +238,7 @@ def _origins(beam: BeamView) -> Block:
     )
 
 
-def _compensation(beam: BeamView, errors: xr.Dataset, key: str) -> list[Block]:
+def _compensation(beam: BeamView, key: str) -> list[Block]:
     corrections = planes_section.compensation(beam.planes, f"{key}-compensation")
     if not (beam.compensated and beam.known):
         if corrections:
@@ -269,20 +269,7 @@ def _compensation(beam: BeamView, errors: xr.Dataset, key: str) -> list[Block]:
         rows,
         [("", 1), ("direction", 3), ("angle", 3)],
     )
-    return [table, *_iterations(errors), *corrections]
-
-
-def _iterations(errors: xr.Dataset) -> list[Block]:
-    iterations = float(errors["iterations"].values.ravel()[0]) if "iterations" in errors else math.nan
-    if not math.isfinite(iterations) or iterations < 1:
-        return []
-    count = f"{integer(iterations)} iterations" if iterations > 1 else "one iteration"
-    return [
-        Text(
-            "The compensation depends on the tilt of each plane to the beam, and the beam on the compensated "
-            f"readings. The result was determined by iteration: {count}."
-        )
-    ]
+    return [table, *corrections]
 
 
 def _uncertainty(errors: xr.Dataset, beam: BeamView) -> list[Block]:
