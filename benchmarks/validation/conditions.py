@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
@@ -20,6 +22,7 @@ SEEDS = 60
 Z95 = 1.959964
 STEP, OUTLIER, TREND, PHI = 10.0, 300.0, 10.0, 0.8
 """Step of the scale, size of an outlier and range of a trend, in standard deviations of the noise; correlation."""
+_NUMBER = re.compile(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,12 @@ class Case:
     over_test: str = ""
     neighbours: str = ""
 
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """The changes that apply to it."""
+        more = {"trend": self.over_test, "correlated": self.neighbours}
+        return ("nominal", "rounded", "outlier", *(name for name, dim in more.items() if dim))
+
 
 CASES = (
     Case("linear_positioning", "positioning", "deviation", 0.3e-6, "run", "target"),
@@ -42,7 +51,17 @@ CASES = (
     Case("multilateration", "", "displacement", 0.2e-6),
     Case("normal_vector", "", "touch", 0.25e-6),
     Case("r_test", "three spheres", "displacement", 0.2e-6, "", "angle"),
+    Case("circular_test", "", "length", 0.2e-6, "run", "sample"),
 )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One data set: the share of intervals that hold the truth, the kinds of its notes, and whether they doubt U."""
+
+    held: float
+    kinds: frozenset[str]
+    doubted: bool
 
 
 def section(seeds: int) -> Iterator[str]:
@@ -52,10 +71,11 @@ def section(seeds: int) -> Iterator[str]:
         f"rounded to {STEP:g} times their noise; one reading wrong by {OUTLIER:g} times the noise; a trend over the "
         f"test of {TREND:g} times the noise, whose truth is that of its beginning; further noise of twice the size "
         f"with a correlation of {PHI:g} between neighbours. "
-        "Noted: data sets with a note that nominal ones do not have, or that are refused. The values of one data set "
+        "Noted: data sets with a kind of note that fewer than half of the nominal ones have, or that are refused; of "
+        "the nominal ones, false alarms. Doubted: with a note that doubts the uncertainty. The values of one data set "
         f"share sources, so that a share has a standard deviation of up to {np.sqrt(0.05 * 0.95 / seeds):.0%}."
     )
-    yield from ("", "| method | condition | held | noted | refused |", "|---|---|---|---|---|")
+    yield from ("", "| method | condition | held | noted | doubted | refused |", "|---|---|---|---|---|---|")
     logging.disable(logging.WARNING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -66,37 +86,42 @@ def section(seeds: int) -> Iterator[str]:
 
 def rows(case: Case, seeds: int) -> Iterator[str]:
     """Yield one row for each condition of a method."""
+    usual: set[str] = set()
+    for condition in case.conditions:
+        found = outcomes(case, condition, seeds)
+        known = [each for each in found if each is not None]
+        if condition == "nominal":
+            count = Counter(kind for each in known for kind in each.kinds)
+            usual = {kind for kind, n in count.items() if 2 * n >= len(known)}
+        refused = len(found) - len(known)
+        noted = refused + sum(not each.kinds <= usual for each in known)
+        doubted = refused + sum(each.doubted for each in known)
+        name = " ".join(filter(None, (f"`{case.method}`", case.subject)))
+        held = f"{np.mean([each.held for each in known]):.1%}" if known else "-"
+        shares = " | ".join(f"{n / seeds:.0%}" for n in (noted, doubted, refused))
+        yield f"| {name} | {condition} | {held} | {shares} |"
+
+
+def outcomes(case: Case, condition: str, seeds: int) -> list[Outcome | None]:
+    """Return what is found with each seed; None where the data are refused."""
     subject = next(
         each
         for each in import_module(f"errormotion.methods.{case.method}.conformance").subjects()
         if each.name == case.subject
     )
-    usual: set[str] = set()
-    for condition in ("nominal", "rounded", "outlier", "trend", "correlated"):
-        if (condition == "trend" and not case.over_test) or (condition == "correlated" and not case.neighbours):
-            continue
-        held, noted, refused = [], 0, 0
-        for seed in range(seeds):
-            raw, truth = subject.make(seed)
-            raw = changed(raw, case, condition, np.random.default_rng([seed, 1]))
-            try:
-                share, notes = outcome(subject, raw, truth)
-            except MethodError:
-                refused += 1
-                continue
-            held.append(share)
-            if condition == "nominal":
-                usual |= notes
-            else:
-                noted += bool(notes - usual)
-        name = " ".join(filter(None, (f"`{case.method}`", case.subject)))
-        inside = f"{np.mean(held):.1%}" if held else "-"
-        says = "" if condition == "nominal" else f"{(noted + refused) / seeds:.0%}"
-        yield f"| {name} | {condition} | {inside} | {says} | {refused / seeds:.0%} |"
+    found: list[Outcome | None] = []
+    for seed in range(seeds):
+        raw, truth = subject.make(seed)
+        raw = changed(raw, case, condition, np.random.default_rng([seed, 1]))
+        try:
+            found.append(outcome(subject, raw, truth))
+        except MethodError:
+            found.append(None)
+    return found
 
 
-def outcome(subject: MethodSubject, raw: xr.Dataset, truth: xr.Dataset) -> tuple[float, set[str]]:
-    """Return the share of intervals that hold the truth, and the beginnings of the notes."""
+def outcome(subject: MethodSubject, raw: xr.Dataset, truth: xr.Dataset) -> Outcome:
+    """Return what is found with one data set."""
     errors = subject.identify(raw)
     for dim in set(errors.em.dims) & set(truth.dims):
         if np.issubdtype(errors[dim].dtype, np.floating):  # a wrong time may be outside of the truth
@@ -105,9 +130,16 @@ def outcome(subject: MethodSubject, raw: xr.Dataset, truth: xr.Dataset) -> tuple
     off = values(errors) - truth_at_places(errors, truth)
     u = np.sqrt(np.einsum("pii->pi", covariance(errors)))
     known = np.isfinite(off) & np.isfinite(u) & ((u > 0) | (off != 0))
-    return float((np.abs(off) <= Z95 * u)[known].mean()), {
-        "".join(c for c in note if not c.isdigit())[:60] for note in errors.em.notes
-    }
+    return Outcome(
+        held=float((np.abs(off) <= Z95 * u)[known].mean()),
+        kinds=frozenset(kind(note) for note in errors.em.notes),
+        doubted=bool(len(np.atleast_1d(errors.attrs.get("doubts_uncertainty", [])))),
+    )
+
+
+def kind(note: str) -> str:
+    """Return a note without its numbers."""
+    return _NUMBER.sub("#", note)
 
 
 def changed(raw: xr.Dataset, case: Case, condition: str, rng: np.random.Generator) -> xr.Dataset:
