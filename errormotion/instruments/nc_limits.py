@@ -9,15 +9,11 @@ refused: their path depends on the state of the control.
 
 from __future__ import annotations
 
-import re
-
-from errormotion.errors import InstrumentError
+from errormotion.errors import InstrumentError, ProgramError
 from errormotion.instruments.door import Door
+from errormotion.instruments.nc_words import COMMENT, printing, split
 
 MAX_CHARACTERS = 1 << 24
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d{1,15}(?:\.\d{0,15})?|\.\d{1,15}))\s*")
-_COMMENT = re.compile(r"\([^()]*\)")
-_PRINTING = re.compile(r"(?:N\d{1,9}\s*)?(?:POPEN|PCLOS|DPRNT\s*\[(?:[^][]|\[[^][]*\])*\])")
 _MOVES = {"0", "1", "31", "38.2", "38.3", "38.4", "38.5"}
 _STRAIGHT = {f"G{code}" for code in _MOVES}
 _OTHERS = {"4", "17", "21", "40", "49", "53", "80", "90", "94"}
@@ -41,23 +37,25 @@ def check_program(text: str, door: Door) -> None:
         return
     stated: set[str] = set()
     for number, line in enumerate(text.splitlines(), 1):
-        plain = _COMMENT.sub(" ", line.upper()).partition(";")[0].strip()
-        if plain in ("", "%") or _PRINTING.fullmatch(plain):
+        if COMMENT.sub("", line).strip() in ("", "%") or printing(line):
             continue
         try:
-            _check_line(plain, door, stated)
+            _check_line(_words(number, line), door, stated)
         except InstrumentError as error:
             raise InstrumentError(f"line {number} '{line.strip()[:60]}' of the program: {error}") from None
 
 
-def _check_line(plain: str, door: Door, stated: set[str]) -> None:
-    words, position = [], 0
-    while position < len(plain):
-        word = _WORD.match(plain, position)
-        if word is None:
-            raise _unknown(plain[position:][:20])
-        words.append((word[1], word[2]))
-        position = word.end()
+def _words(number: int, line: str) -> list[tuple[str, str]]:
+    try:
+        block = split(number, line)
+    except ProgramError:
+        raise _unknown(line.strip()[:20]) from None
+    if block.skippable:
+        raise _unknown("/")
+    return [(letter, value) for letter, value, _ in block.words]
+
+
+def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> None:
     codes = {f"{letter}{float(value):g}" for letter, value in words}
     dwell = "G4" in codes
     for letter, value in words:

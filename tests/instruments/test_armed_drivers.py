@@ -217,7 +217,7 @@ def test_a_program_within_the_limits_is_accepted(text: str) -> None:
         ("G90 G94 G21\nG1 X[1+900] F100\n", "unknown"),
         ("O100 sub\n", "unknown"),
         ("G90 G94 G21\nG1 X1e9 F100\n", "unknown"),
-        ("G90 G94 G21\nG1 X9999999999999999 F100\n", "unknown"),
+        ("G90 G94 G21\nG1 X9999999999999999 F100\n", "X would move to"),
         ("G90 G94 G21\nG1 X1 Finf\n", "unknown"),
         ("G90 G94 G21\nG1 A1 F100\n", "'A1'"),
     ],

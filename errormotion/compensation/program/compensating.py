@@ -17,12 +17,12 @@ from errormotion.compensation.program.interpreter.screening import screen
 from errormotion.compensation.program.reading.frames import Triple
 from errormotion.compensation.program.reading.offsets import Offsets
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import MAX_LINE, BlockError, is_title, lines_of, refusal
 from errormotion.compensation.program.writing.dividing import Correcting
 from errormotion.compensation.program.writing.rewriting import Rewriting, Summary
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import replacing
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import MAX_LINE, BlockError, is_title, lines_of, refusal
 
 MAX_PROGRAM = 1 << 29
 """Maximum size of a program file, bytes."""

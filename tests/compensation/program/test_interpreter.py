@@ -83,6 +83,12 @@ def test_the_plain_code_of_a_program_moves_as_the_program() -> None:
         assert np.allclose(moves_of(new)[-1].end, old[-1].end, atol=1e-4)
 
 
+def test_codes_with_zeros_and_spaces_are_those_without() -> None:
+    plain = ["G21 G90", "T2 M6", "G43 H2", "G55", "G0 X0 Y0 Z0", "G92 X5 Y6", "F60 G1 X[6+1]", "G92.1", "G0 X1", "M2"]
+    other = ["G21 G90", "T2 M6", "G 043 H 2", "G55", "G0 X0 Y0 Z0", "G 9 2 X5 Y6", "F60 G1 X[6+1]", "G 92. 1"]
+    assert expanded([*other, "G0 X1", "M 02"]) == expanded(plain)
+
+
 def test_offsets_tools_and_switches_are_kept() -> None:
     lines = [
         *("G21 G90", "T2 M6", "G43 H2", "G55", "S900 M3", "G0 X0 Y0 Z0", "G92 X5 Y6", "F60 G1 X[6+1]", "M62 P1"),

@@ -10,8 +10,8 @@ from nc_paths import ORIGINS, moves_of
 from errormotion.compensation.program.reading.items import Text, Unchanged
 from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import MAX_LINE
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import MAX_LINE
 
 HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0"]
 

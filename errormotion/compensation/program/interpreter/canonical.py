@@ -23,8 +23,8 @@ import numpy as np
 from errormotion.compensation.program.interpreter.parameters import GUARD, UNKNOWN_TOOL, UNSTATED, Parameters
 from errormotion.compensation.program.reading.offsets import UNITS, Offsets
 from errormotion.compensation.program.reading.tools import Cutter
-from errormotion.compensation.program.reading.words import MAX_BLOCK, lines_of, refusal
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import COMMENT, MAX_BLOCK, lines_of, refusal
 
 MAX_COMMANDS = 5_000_000
 """Maximum number of commands of one program; it ends endless loops."""
@@ -34,7 +34,6 @@ TIME_LIMIT = 300.0
 
 _NUMBERED = re.compile(r"^(\s*/?)\s*(?:[nN]\s*(\d+)\s*)?")
 _COMMAND = re.compile(r"^\s*\d+ N(\d+|\.+)\s*([A-Z_0-9]+)\((.*)\)$")
-_COMMENT = re.compile(r"\([^()]*\)|;.*")
 _METRIC = re.compile(r"G\s*0*21(?![.\d])", re.IGNORECASE)
 _OTHER_UNIT = re.compile(r"G\s*0*20(?![.\d])|G\s*[\[#]|_metric|_imperial", re.IGNORECASE)
 _INCH = UNITS["inch"]
@@ -166,11 +165,11 @@ def in_units_of_the_machine(source: Iterable[str], unit: str) -> list[str] | Non
         return lines
     new = []
     for text in lines:
-        plain = _COMMENT.sub("", text)
+        plain = COMMENT.sub("", text)
         if _OTHER_UNIT.search(plain):
             return None
-        pieces = _COMMENT.split(text)
-        comments = _COMMENT.findall(text)
+        pieces = COMMENT.split(text)
+        comments = COMMENT.findall(text)
         pieces = [_METRIC.sub("G20", piece) for piece in pieces]
         new.append("".join(a + b for a, b in zip(pieces, [*comments, ""], strict=True)))
     return new

@@ -7,7 +7,6 @@ line.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
@@ -15,21 +14,12 @@ from errormotion.compensation.program.interpreter.canonical import Command, own_
 from errormotion.compensation.program.reading.frames import Frame, Triple
 from errormotion.compensation.program.reading.items import PLANES
 from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
-from errormotion.compensation.program.reading.words import SourceLine, refusal
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import SourceLine, codes_of, refusal, words_of
 
 _DIGIT = 5e-5  # half of the last digit that the interpreter prints
-_PROBE = re.compile(r"G\s*(38\.[2-5])")
-_TOOL = re.compile(r"G\s*43(?![.\d])")
-_HEIGHT = re.compile(r"H\s*(\d+)(?![.\d\[#])")
-_IN_MACHINE = re.compile(r"G\s*(53|28|30)(?![.\d])")
-_END = re.compile(r"M\s*0*(2|30)(?![.\d])")
-_STATED = re.compile(r"G\s*10(?![.\d])")
-_IN_ORDER = re.compile(r"\[[^\]]*\]|#\s*<[^>]*>")  # expressions and names, which may contain the letters of axes
-_CYCLE = re.compile(r"G\s*(?:8[1-9]|73)(?![\d.])")
-_SIDE = re.compile(r"G\s*0*4([012])(?:\s*\.\s*1)?(?![\d.])", re.IGNORECASE)
-_NAMES = re.compile(r"#\s*<[^>]*>")
-_COMMENT = re.compile(r"\([^()]*\)|;.*")
+_CYCLES = {"G73", *(f"G{number}" for number in range(81, 90))}
+_SIDES = {"G40", "G41", "G42", "G41.1", "G42.1"}
 _FAR = 1e3
 """Largest coordinate, m; larger ones follow from a value that is unknown."""
 _WORDS = {
@@ -159,9 +149,9 @@ class Expansion:
             if command.name == "PROGRAM_END":
                 ended = True
                 self.end = command.line
-                yield self._with_number(command, "M30" if "30" in self._text(command) else "M2")
+                yield self._with_number(command, "M30" if "M30" in self._codes(command) else "M2")
                 continue
-            if command.name in _RESET and _END.search(self._text(command)):
+            if command.name in _RESET and {"M2", "M30"} & self._codes(command):
                 continue  # what the end of a program resets
             for text in self._blocks(command):
                 yield self._with_number(command, text)
@@ -178,16 +168,21 @@ class Expansion:
             self._changing = False
             return [_WORDS[name].format(*command.numbers())]
         if name == "PROGRAM_STOP":
-            return ["M60" if re.search(r"M\s*60(?![.\d])", self._text(command)) else "M0"]
+            return ["M60" if "M60" in self._codes(command) else "M0"]
         handler = self._handlers.get(name)
         if handler is None:
             raise self._refusal(command, f"{name} cannot be expanded")
         return handler(command)
 
     def _text(self, command: Command) -> str:
-        if not 0 < command.line <= len(self._source):
-            return ""
-        return _COMMENT.sub(" ", self._source[command.line - 1]).upper()
+        return self._source[command.line - 1] if 0 < command.line <= len(self._source) else ""
+
+    def _stated(self, command: Command) -> dict[str, str]:
+        """Return the numbers of the words of its line by their letters; a number is empty if it is computed."""
+        return dict(words_of(self._text(command)))
+
+    def _codes(self, command: Command) -> set[str]:
+        return set(codes_of(self._text(command)))
 
     def _with_number(self, command: Command, text: str) -> SourceLine:
         self._line = command.line or self._line
@@ -224,14 +219,14 @@ class Expansion:
     def _origin(self, command: Command) -> list[str]:
         given = self._three(command, command.numbers()[1:])
         k, scale = int(command.numbers()[0]) - 1, self._frame.scale
-        text = self._text(command)
+        codes, stated = self._codes(command), self._stated(command)
         known = list(self._systems[k])
         words = ""
         for axis, (value, old) in enumerate(zip(given, known, strict=True)):
-            stated = old == old or (_STATED.search(text) and "XYZ"[axis] in text)
-            if not stated or abs(value - old / scale) <= 1.5 * _DIGIT:
+            has_value = old == old or ("G10" in codes and "XYZ"[axis] in stated)
+            if not has_value or abs(value - old / scale) <= 1.5 * _DIGIT:
                 continue
-            if re.search(r"L\s*20", text) and not self._known[axis]:
+            if stated.get("L") and float(stated["L"]) == 20 and not self._known[axis]:
                 raise self._refusal(command, "an origin at a position that is unknown before the program runs")
             words += f" {'XYZ'[axis]}{value:.4f}"
             known[axis] = value * scale
@@ -254,14 +249,14 @@ class Expansion:
 
     def _shift(self, command: Command) -> list[str]:
         new = _triple(value * self._frame.scale for value in self._three(command, command.numbers()))
-        text = self._text(command)
-        found = re.search(r"G\s*92\s*\.\s*([123])", text)
+        codes = self._codes(command)
         same = all(abs(a - b) <= 1.5 * _DIGIT * self._frame.scale for a, b in zip(new, self._frame.g92, strict=True))
         self._change(replace(self._frame, g92=new))
-        if found is not None:
-            return [f"G92.{found[1]}"]
-        if re.search(r"G\s*92(?![.\d])", text):
-            axes = [k for k, axis in enumerate("XYZ") if axis in text]
+        if kept := codes & {"G92.1", "G92.2", "G92.3"}:
+            return [min(kept)]
+        if "G92" in codes:
+            stated = self._stated(command)
+            axes = [k for k, axis in enumerate("XYZ") if axis in stated]
             return ["G92 " + " ".join(f"{'XYZ'[k]}{self._at[k]:.4f}" for k in axes)]
         if same:
             return []
@@ -271,17 +266,17 @@ class Expansion:
         x, y, z = self._three(command, command.numbers())
         scale = self._frame.scale
         new = (x * scale, y * scale, z * scale)
-        text = _NAMES.sub(" ", self._text(command))
-        number = _HEIGHT.search(text)
-        if _TOOL.search(text) and number is not None:
-            if int(number[1]) in self._offsets.tools:
-                new = _triple(self._offsets.tools[int(number[1])])
+        codes, height = self._codes(command), self._stated(command).get("H")
+        if "G43" in codes and height and float(height).is_integer():
+            number = int(float(height))
+            if number in self._offsets.tools:
+                new = _triple(self._offsets.tools[number])
             self._change(replace(self._frame, tool=new))
-            return [f"G43 H{number[1]}"]
+            return [f"G43 H{number}"]
         self._change(replace(self._frame, tool=new))
         if not any(new):
             return ["G49"]
-        if _TOOL.search(text) and "H" not in text:
+        if "G43" in codes and height is None:
             return ["G43"]
         return [f"G43.1 X{x:.4f} Y{y:.4f} Z{z:.4f}"]
 
@@ -339,11 +334,11 @@ class Expansion:
         """
         if any(not abs(value) * self._frame.scale <= _FAR for value in new):
             raise self._refusal(command, "moves too far: the size of the tool or another value is unknown")
-        text = ""
+        stated: dict[str, str] = {}
         if not all(self._known):
-            text = _IN_ORDER.sub(" ", self._text(command))
+            stated = self._stated(command)
             a, b, c = PLANES[self._plane]
-            if not self._known[c] and _CYCLE.search(text):
+            if not self._known[c] and _CYCLES & self._codes(command):
                 raise self._refusal(command, f"a canned cycle while the position of {'XYZ'[c]} is unknown")
             if not (self._known[a] and self._known[b]) and command.line in self._compensated:
                 raise self._refusal(command, "cutter compensation that starts at an unknown position")
@@ -352,7 +347,7 @@ class Expansion:
             if self._known[k]:
                 if abs(new[k] - self._at[k]) > _DIGIT:
                     words.append(f"{axis}{new[k]:.4f}")
-            elif axis in text:
+            elif axis in stated:
                 if self._incremental:
                     raise self._refusal(command, f"an increment of {axis} from an unknown position")
                 self._known[k] = True
@@ -365,8 +360,8 @@ class Expansion:
     def _straight(self, command: Command) -> list[str]:
         new = self._three(command, command.numbers())
         code = "G0" if command.name == "STRAIGHT_TRAVERSE" else "G1"
-        if code == "G0" and (found := _IN_MACHINE.search(self._text(command))):
-            return self._in_machine(command, new, found[1])
+        if code == "G0" and (found := self._codes(command) & {"G53", "G28", "G30"}):
+            return self._in_machine(command, new, min(found))
         words = self._place(command, new)
         return [f"{code} {words}"] if words else []
 
@@ -374,9 +369,9 @@ class Expansion:
         """Return the block of G53, G28 or G30, a move to a position in machine coordinates."""
         if self._frame.rotation:
             raise self._refusal(command, "a position in machine coordinates with a rotated work offset")
-        text = _IN_ORDER.sub(" ", self._text(command))
-        axes = [k for k in range(3) if "XYZ"[k] in text]
-        if code != "53":
+        stated = self._stated(command)
+        axes = [k for k in range(3) if "XYZ"[k] in stated]
+        if code != "G53":
             return self._home(new, code, axes)
         if any(v != v for v in self._systems[self._system]):
             raise self._refusal(command, "a position in machine coordinates with an unknown work offset")
@@ -394,23 +389,23 @@ class Expansion:
         old, self._at = self._at, new
         self._homing = not self._homing
         if not self._homing:
-            home = self._offsets.homes[0 if code == "28" else 1]
+            home = self._offsets.homes[0 if code == "G28" else 1]
             origin = self._systems[self._system]
             for k in axes or range(3):
                 self._known[k] = home[k] == home[k] and origin[k] == origin[k]
             return []
         base = old if self._incremental else (0.0, 0.0, 0.0)
-        block = " ".join([f"G{code}", *(f"{'XYZ'[k]}{new[k] - base[k]:.4f}" for k in axes)])
+        block = " ".join([code, *(f"{'XYZ'[k]}{new[k] - base[k]:.4f}" for k in axes)])
         return ["G91", block, "G90"] if self._incremental and axes else [block]
 
     def _probe(self, command: Command) -> list[str]:
-        found = _PROBE.search(self._text(command))
-        if found is None:
+        found = self._codes(command) & {"G38.2", "G38.3", "G38.4", "G38.5"}
+        if not found:
             raise self._refusal(command, "a probing move that no line of the program states")
         words = self._place(command, self._three(command, command.numbers()))
         for word in words.split():
             self._known["XYZ".index(word[0])] = False
-        return [f"G{found[1]} {words}"]
+        return [f"{min(found)} {words}"]
 
     def _arc(self, command: Command) -> list[str]:
         first, second, x, y, turns, third, *more = command.numbers()
@@ -432,10 +427,10 @@ def _compensated(source: Iterable[str]) -> set[int]:
     found: set[int] = set()
     active = False
     for line, text in enumerate(source, 1):
-        sides = _SIDE.findall(_COMMENT.sub(" ", text))
-        if active or any(side != "0" for side in sides):
+        sides = [code for code in codes_of(text) if code in _SIDES]
+        if active or any(side != "G40" for side in sides):
             found.add(line)
-        active = sides[-1] != "0" if sides else active
+        active = sides[-1] != "G40" if sides else active
     return found
 
 

@@ -14,8 +14,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from errormotion.compensation.program.reading.offsets import SYSTEMS, Offsets
-from errormotion.compensation.program.reading.words import MAX_BLOCK, refusal
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import COMMENT, MAX_BLOCK, code_of, refusal, words_of
 
 UNSTATED = -98765.4321
 """Value of the parameters that nothing states."""
@@ -26,12 +26,10 @@ UNKNOWN_TOOL = 2147400123
 GUARD = "Argument to acos out of range"
 """Error of the interpreter for a value that is not known."""
 
-_COMMENT = re.compile(r"\([^()]*\)|;.*")
 _DEBUG = re.compile(r"\(\s*DEBUG\s*,", re.IGNORECASE)
 _IN_COMMENT = re.compile(r"#(?:<[^>]*>|\d+)")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _FUNCTION = re.compile(r"[a-z]+(?=\[)")
-_CODE = re.compile(r"(?<![a-z<_])([gm])(\d+\.?\d*)|(?<![a-z<_])([tfs])(?=[-+\d.\[#])")
 _NAME = re.compile(r"(?:#|(?<=o))<[^>]*>")
 _WORD = re.compile(
     r"^/?(?:n\d+)?o(\d+|<[^>]*>|\[[^\]]*\]|#<[^>]*>|#\d+)"
@@ -173,7 +171,7 @@ class Parameters:
         return found
 
     def _line(self, number: int, text: str, scope: _Scope) -> str:
-        for comment in _COMMENT.finditer(text):
+        for comment in COMMENT.finditer(text):
             if _DEBUG.match(comment[0]):
                 for found in _IN_COMMENT.finditer(_squeezed(comment[0])):
                     if self._value(number, text, found[0], scope) != found[0]:
@@ -184,7 +182,7 @@ class Parameters:
             return text
         pieces: list[str] = []
         at = 0
-        ends = [*((comment.start(), comment.end()) for comment in _COMMENT.finditer(text)), (len(text), len(text))]
+        ends = [*((comment.start(), comment.end()) for comment in COMMENT.finditer(text)), (len(text), len(text))]
         for start, end in ends:
             piece = text[at:start]
             new = self._rewritten(number, text, _NO_TOOL.sub(f"t{UNKNOWN_TOOL}", _squeezed(piece)), scope)
@@ -323,16 +321,14 @@ class Parameters:
 
 def _codes(plain: str) -> set[str]:
     """Return the codes of a line in a canonical form, such as ``g1`` and ``m3``, and ``t``, ``f``, ``s``."""
-    found = plain
-    while (shorter := re.sub(r"\[[^\[\]]*\]", "", found)) != found:
-        found = shorter
-    found = re.sub(r"#<[^>]*>=?", "", found)
-    return {letter + f"{float(value):g}" if letter else other for letter, value, other in _CODE.findall(found)}
+    found = words_of(plain)
+    codes = {f"{letter}{float(number):g}" for letter, number in found if letter in "GM" and number}
+    return {code.lower() for code in codes | ({letter for letter, _ in found} & set("TFS"))}
 
 
 def _code(text: str) -> str:
     """Return a line as the interpreter reads it: in lower case, without comments and spaces."""
-    return _squeezed(_COMMENT.sub("", text))
+    return code_of(text).lower()
 
 
 def _squeezed(text: str) -> str:

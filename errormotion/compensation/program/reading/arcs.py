@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from errormotion.compensation.program.reading.frames import Triple
-from errormotion.compensation.program.reading.words import Block, refusal
+from errormotion.instruments.nc_words import Block, refusal
 
 SPIRAL = 1e-3
 """Largest relative difference of the radii at start and end; LinuxCNC rejects larger ones too."""

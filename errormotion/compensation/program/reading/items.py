@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from errormotion.compensation.program.reading.frames import Frame, Triple
-from errormotion.compensation.program.reading.words import Block
+from errormotion.instruments.nc_words import Block
 
 RAPID, LINE, CLOCKWISE, COUNTERCLOCKWISE = 0, 1, 2, 3
 

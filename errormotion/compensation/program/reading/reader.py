@@ -14,7 +14,7 @@ from errormotion.compensation.program.reading import arcs
 from errormotion.compensation.program.reading.frames import Frame, Triple
 from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Item, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import SYSTEMS, UNITS, Offsets
-from errormotion.compensation.program.reading.words import Block, is_title, lines_of, refusal, split
+from errormotion.instruments.nc_words import Block, is_title, lines_of, refusal, split
 
 UNKNOWN: Triple = (math.nan, math.nan, math.nan)
 

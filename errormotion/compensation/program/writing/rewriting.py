@@ -11,11 +11,11 @@ import numpy as np
 from errormotion.arrays import Array
 from errormotion.compensation.program.reading.items import LINE, RAPID, Item, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.reader import Reader
-from errormotion.compensation.program.reading.words import MAX_BLOCK
 from errormotion.compensation.program.writing.dividing import Correcting, Division, divide
 from errormotion.compensation.program.writing.path import Indices, Path
 from errormotion.compensation.program.writing.writer import DECIMALS, Writer
 from errormotion.errors import ProgramError
+from errormotion.instruments.nc_words import MAX_BLOCK
 
 MAX_WRITTEN = 20_000_000
 """Maximum number of lines of the new program."""

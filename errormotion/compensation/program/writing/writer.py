@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from errormotion.compensation.program.reading.frames import Frame, Triple
 from errormotion.compensation.program.reading.items import LINE, PLANES, RAPID, Move, Setting, Text, Unchanged
 from errormotion.compensation.program.reading.offsets import UNITS
-from errormotion.compensation.program.reading.words import STRIDE
+from errormotion.instruments.nc_words import STRIDE
 
 DECIMALS = {UNITS["mm"]: 4, UNITS["inch"]: 5}
 """Printed digits after the decimal point for each unit of programs."""

@@ -12,6 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from errormotion.errors import ErrormotionError, InstrumentError
+from errormotion.instruments.nc_words import COMMENT, BlockError, printing, split
 from errormotion.instruments.simulators.virtual_world.printing import PortCommand, parse_block
 from errormotion.twin.paths import Path
 
@@ -21,8 +22,6 @@ UNDERSTOOD = (
 )
 MM, MINUTE, MILLI = 1000.0, 60.0, 1000.0  # per m; s; per s
 
-_WORD = re.compile(r"([A-Z])\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*")
-_COMMENT = re.compile(r"\([^()]*\)")
 _REFUSED = {
     "G20": "inches are not supported; use mm and G21",
     "G91": "incremental positions are not supported; use G90 and positions of the axes",
@@ -32,8 +31,6 @@ _REFUSED = {
 _WITHOUT_EFFECT = ("G21", "G90", "G94")  # the only supported units, positions and feeds
 _ROUNDING = 1e-9  # m
 
-_PRINT = re.compile(r"(?:N\d+\s*)?DPRNT\s*\[(.*)\]")
-_PORT = re.compile(r"(?:N\d+\s*)?(POPEN|PCLOS)")
 _SKIPPED = {"5061": 0, "5062": 1, "5063": 2}  # end position of the last skip move
 _CLOCK = "3001"  # clock of the control, ms
 
@@ -91,14 +88,14 @@ def interpret(
     """
     control = _Control(start, travel, rapid, peripherals)
     for number, line in enumerate(text.splitlines(), 1):
-        plain = _COMMENT.sub(" ", line).partition(";")[0].strip().upper()
         try:
-            if printed := _PRINT.fullmatch(plain):
-                control.print(printed[1])
-            elif port := _PORT.fullmatch(plain):
-                control.switch_port("POPEN" if port[1] == "POPEN" else "PCLOS")
+            command, template = printing(line) or ("", "")
+            if command == "DPRNT":
+                control.print(template)
+            elif command:
+                control.switch_port("POPEN" if command == "POPEN" else "PCLOS")
             else:
-                control.execute(_words(plain))
+                control.execute(_words(number, line))
         except ErrormotionError as error:
             raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}") from None
         if control.ended:
@@ -112,18 +109,17 @@ def title(text: str) -> str:
     return ((found[1] or found[2] or "").strip() if found else "") or "program"
 
 
-def _words(plain: str) -> list[tuple[str, float]]:
+def _words(number: int, line: str) -> list[tuple[str, float]]:
     """Return letters and numbers of a line."""
-    if plain == "%":
+    if COMMENT.sub("", line).strip() == "%":
         return []
-    words, k = [], 0
-    while k < len(plain):
-        word = _WORD.match(plain, k)
-        if word is None:
-            raise InstrumentError(f"'{plain[k:][:20]}' is not a word of a program; supported are {UNDERSTOOD}")
-        words.append((word[1], float(word[2])))
-        k = word.end()
-    return words
+    try:
+        block = split(number, line)
+    except BlockError as error:
+        raise InstrumentError(f"{error.why}; supported are {UNDERSTOOD}") from None
+    if block.skippable:
+        raise InstrumentError(f"'/' is not a word of a program; supported are {UNDERSTOOD}")
+    return [(letter, float(value)) for letter, value, _ in block.words]
 
 
 class _Control:

@@ -1,7 +1,7 @@
-"""The words of a block of RS-274 (ISO 6983) code, and their original texts.
+"""The words of lines of NC programs (ISO 6983, RS-274), for every reader of programs.
 
-A line is split into text between words, letters, numbers and comments. The joined parts are the line. Expressions,
-variables and control words (``O``) are no words and raise an error with the number of the line.
+`split` returns the words of a line with their original texts; expressions, variables and control words (``O``) are no
+words and raise an error with the number of the line. `words_of` returns the words of a line that may have them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,21 @@ MAX_LINE = 1024
 MAX_LINES = 5_000_000
 """Maximum number of lines of one program."""
 
-_PARTS = re.compile(r"(?:([A-Za-z])[ \t]*([-+]?(?:\d{1,15}\.?\d{0,15}|\.\d{1,15})))|(\([^()]*\)|;.*)")
-_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
-_OTHER = re.compile(r"#|\[|<")
+COMMENT = re.compile(r"\([^()]*\)|;.*")
+
 STRIDE = 4
 """Number of parts that repeat along a line: text between, letter, number, comment."""
 
-
+_NUMBER = r"[-+]?(?:\d{1,15}\.?\d{0,15}|\.\d{1,15})"
+_PARTS = re.compile(rf"(?:([A-Za-z])[ \t]*({_NUMBER}))|({COMMENT.pattern})", re.ASCII)
+_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+_OTHER = re.compile(r"#|\[|<")
+_PRINTING = re.compile(r"(?:N\d{1,9}\s*)?(POPEN|PCLOS|DPRNT\s*\[((?:[^][]|\[[^][]*\])*)\])", re.ASCII)
+_NAME = re.compile(r"<[^<>]*>")
+_INSIDE = re.compile(r"\[[^\[\]]*\]")
+_VALUE = re.compile(r"[-+]*#+\d*", re.ASCII)
+_FUNCTION = re.compile(r"(?:ABS|ACOS|ASIN|ATAN|COS|EXISTS|EXP|FIX|FUP|LN|ROUND|SIN|SQRT|TAN)#(?:/#)?")
+_WORD = re.compile(r"([A-Z])([-+]?(?:\d+\.?\d*|\.\d+))?", re.ASCII)
 _TITLE = re.compile(r"\s*(?:[nN]\s*\d+\s*)?[oO]\s*\d+\s*(?:\([^()]*\)\s*|;.*)*")
 
 
@@ -116,6 +124,30 @@ def _unknown(line: int, text: str, pieces: list[str]) -> BlockError:
     if any(_OTHER.search(piece) for piece in pieces) or text.lstrip().lower().startswith("o"):
         return refusal(line, text, "an expression, a variable or a control word (O), not supported by the plain reader")
     return refusal(line, text, f"expected words (letter and number) and comments; found '{pieces[0][:20]}'")
+
+
+def code_of(text: str) -> str:
+    """Return a line as a control reads it: in upper case, without comments and spaces."""
+    return re.sub(r"\s", "", COMMENT.sub("", text)).upper()
+
+
+def words_of(text: str) -> list[tuple[str, str]]:
+    """Return letter and number of each word of a line with expressions; the number is empty if it is computed."""
+    found = _NAME.sub("", code_of(text))
+    while (shorter := _INSIDE.sub("#", found)) != found:
+        found = shorter
+    return _WORD.findall(_VALUE.sub("#", _FUNCTION.sub("#", _VALUE.sub("#", found))))
+
+
+def codes_of(text: str) -> list[str]:
+    """Return the codes G and M of a line with expressions, such as ``G43.1`` and ``M3``; ``G`` if it is computed."""
+    return [letter + (f"{float(number):g}" if number else "") for letter, number in words_of(text) if letter in "GM"]
+
+
+def printing(text: str) -> tuple[str, str] | None:
+    """Return command and template of a line that prints: ``POPEN``, ``PCLOS`` or ``DPRNT``; None for other lines."""
+    found = _PRINTING.fullmatch(COMMENT.sub(" ", text).strip().upper())
+    return (found[1][:5], found[2] or "") if found is not None else None
 
 
 def is_title(text: str) -> bool:
