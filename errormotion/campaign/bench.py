@@ -215,9 +215,15 @@ class OpenBench:
         """Return all instruments of this kind by their names on the bench."""
         return {a.instrument.name: a.driver for a in self.answers if a.instrument.driver.info.kind == kind}
 
-    def ask(self, message: str) -> None:
-        """Send a request to the operator and wait until it is done; returns immediately on a virtual bench."""
-        if self.virtual:
+    def ask(self, message: str, action: str = "", **values: Any) -> None:
+        """Send a request to the operator and wait until it is done; returns immediately on a virtual bench.
+
+        A virtual machine that can do the ``action`` does it, instead of the operator.
+        """
+        acting = [answer.driver for answer in self.answers if action and hasattr(answer.driver, "act")]
+        for driver in acting:
+            driver.act(action, **values)
+        if acting or self.virtual:
             return
         if self._ask is None:
             raise BenchError(

@@ -316,8 +316,13 @@ class Bench(Protocol):
     def has_kind(self, kind: str) -> bool:
         """Whether the bench has an instrument of this kind."""
 
-    def ask(self, message: str) -> None:
-        """Request an action of the operator and wait for it; returns at once on a virtual machine."""
+    def ask(self, message: str, action: str = "", **values: Any) -> None:
+        """Request an action of the operator and wait for it; returns at once on a virtual machine.
+
+        ``action`` and its values are for a virtual machine that can do it: ``set_station`` with the ``position`` of the
+        laser tracker, m, or ``set_target`` with the ``kind`` of the target of a point sensor (``plane``, ``bar``) and,
+        for a plane, ``inclination`` and ``rotation``, rad.
+        """
 
 
 @dataclass(frozen=True)

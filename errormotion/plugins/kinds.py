@@ -316,13 +316,6 @@ class Probes(Protocol):
         """Move to a target, m, until the probe triggers; return ``tripped``, ``position`` (m or None), ``time`` (s)."""
 
 
-class PassesTime(Protocol):
-    """A controller with its own clock."""
-
-    def elapse(self, seconds: float) -> None:
-        """Advance the clock of the machine, s."""
-
-
 @changing
 class RunsSchedules(Protocol):
     """A controller that mounts artefacts and executes a schedule of spindle speeds."""
@@ -342,33 +335,14 @@ class StepsSphere(Protocol):
         """Start a step program: first position, m, direction, step, m, number of steps, and dwell at each, s."""
 
 
-@changing
-class SetsTarget(Protocol):
-    """A controller that turns a gauge in front of a point sensor."""
-
-    def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
-        """Mount a plane, a bar or nothing; a plane with its inclination and rotation, rad."""
-
-
-@changing
-class CarriesTracker(Protocol):
-    """A controller that moves the laser tracker to a station."""
-
-    def set_station(self, position: Position) -> None:
-        """Move the tracker to a position in machine coordinates, m."""
-
-
 @contract(
     capabilities=(
         MovesAxes,
         TurnsSpindle,
         RunsPrograms,
         Probes,
-        PassesTime,
         RunsSchedules,
         StepsSphere,
-        SetsTarget,
-        CarriesTracker,
     )
 )
 class Controller(Instrument, Protocol):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -66,6 +67,20 @@ def test_of_several_instruments_of_a_kind_one_is_chosen_by_name(bench: Callable[
         assert chosen["counter"].virtual
         assert not chosen["other"].virtual
     assert plugins.get("instruments", "counter").opened == []
+
+
+def test_a_virtual_machine_does_what_the_operator_of_a_real_one_is_requested_to_do(
+    bench: Callable[..., BenchPlan],
+) -> None:
+    asked: list[str] = []
+    done: list[tuple[str, dict[str, Any]]] = []
+    with OpenBench(bench("simulated = false"), asked.append) as table:
+        driver = table.of_kind("counter")
+        driver.act = lambda action, **values: done.append((action, values))
+        table.ask("Move the tracker.", "set_station", position=[0.1, 0.2, 0.3])
+        table.ask("Mount the bar.")
+    assert done == [("set_station", {"position": [0.1, 0.2, 0.3]})]
+    assert asked == ["Mount the bar."]
 
 
 def test_the_operator_is_prompted_for_real_instruments_only(bench: Callable[..., BenchPlan]) -> None:

@@ -73,7 +73,7 @@ class Operator:
 def lab(tmp_path, monkeypatch):
     """Return a function that writes bench and campaign; an operator moves the tracker."""
     monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
-    monkeypatch.delattr(VirtualController, "set_station")
+    monkeypatch.delattr(VirtualController, "act")
 
     def write(fault="", **changes):
         text = CAMPAIGN

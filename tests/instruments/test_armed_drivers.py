@@ -40,6 +40,8 @@ ARGUMENTS: dict[str, Any] = {
     "step": 1e-3,
     "count": 3,
     "kind": "plane",
+    "action": "set_target",
+    "values": {},
     "programs": 1,
     "touches": [Touch((0.0, 0.0, 0.1), (0.0, 0.0, 0.09))],
 }

@@ -113,6 +113,7 @@ class VirtualController(Driver):
     )
     Settings: ClassVar[type[ControllerSettings]] = ControllerSettings
     settings: ControllerSettings
+    virtual = True
     _number = 0
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
@@ -389,6 +390,12 @@ class VirtualController(Driver):
     def reset(self) -> None:
         """Clear alarm and emergency stop; this starts no motion."""
         self._change("reset")
+
+    def act(self, action: str, **values: Any) -> None:
+        """Do what an operator of a real machine would do: ``set_target`` or ``set_station``, with their arguments."""
+        if action not in ("set_target", "set_station"):
+            raise InstrumentError(f"Expected the action set_target or set_station; found {action!r}")
+        self._change(action, **values)
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
         """Put a target in front of the point sensors, which are then mounted on the stage.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from errormotion.errors import InstrumentError
 from errormotion.plugins import Contact, Touch
+from errormotion.plugins.virtual import wait
 
 Array = NDArray[np.float64]
 
@@ -30,9 +31,6 @@ class Prober(Protocol):
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
         """Move in a straight line until the probe trips."""
-
-    def elapse(self, seconds: float) -> None:
-        """Wait."""
 
     def stop(self) -> None:
         """Abort all motion."""
@@ -199,7 +197,7 @@ class Toucher:
                     raise
                 if attempt == self._how.attempts:
                     raise StuckError(f"the probe is tripped before it moves, and remains so: {error}") from error
-                self._control.elapse(self._how.settling)
+                wait(self._control, self._how.settling)
                 continue
             return found if found["tripped"] else None
         return None

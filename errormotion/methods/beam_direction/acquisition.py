@@ -20,6 +20,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.motions import search_start, stage_path
 from errormotion.methods.beam_direction.planning import design
 from errormotion.methods.beam_direction.schema import SCHEMA
+from errormotion.plugins.virtual import is_virtual
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -45,8 +46,8 @@ def measure_planes(
     Parameters
     ----------
     bench : Bench
-        With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). It also sets
-        the gauge if it can (``set_target``); otherwise the operator is requested to set it.
+        With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). The operator is
+        requested to set the gauge; a virtual machine sets it.
     settings : Settings
     inputs : mapping
         Not used.
@@ -92,7 +93,7 @@ class Setup:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
         self.control: Any = control_of(bench)
-        virtual = hasattr(self.control, "elapse")
+        virtual = is_virtual(self.control)
         self.origin: float | None = float(self.control.state()["time"]) if virtual else None
         self.low, self.high = (float(x) for x in self.sensor.measuring_range)
         self.middle = float(self.sensor.mid_range)
@@ -112,12 +113,13 @@ class Setup:
         """Move the sensor away, and set the gauge to a face."""
         face = self.settings.planes[number]
         self.move(self.start() - self.sign * self.layout.search * self.beam)
-        if hasattr(self.control, "set_target"):
-            self.control.set_target("plane", inclination=face.inclination, rotation=face.rotation)
-            return
         self.bench.ask(
             f"Face {number + 1} of {len(self.settings.planes)}: set the sine gauge to an inclination of "
-            f"{np.degrees(face.inclination):.6g} deg and its turntable to {np.degrees(face.rotation):.6g} deg."
+            f"{np.degrees(face.inclination):.6g} deg and its turntable to {np.degrees(face.rotation):.6g} deg.",
+            "set_target",
+            kind="plane",
+            inclination=face.inclination,
+            rotation=face.rotation,
         )
 
     def start(self) -> Array:

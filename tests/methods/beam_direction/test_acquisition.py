@@ -89,7 +89,10 @@ class Bench:
     def of_kind(self, kind):
         return self.sensor if kind == "point_lds" else self.stage
 
-    def ask(self, message):
+    def ask(self, message, action="", **values):
+        if isinstance(self.stage, SettingStage):
+            getattr(self.stage, action)(**values)
+            return
         self.asked.append((message, self.stage.place.copy()))
         self.by_hand = np.radians([20.0, (0.0, 90.0, 180.0)[len(self.asked) - 1]])
 

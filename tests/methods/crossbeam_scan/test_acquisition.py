@@ -57,7 +57,7 @@ class Machine:
         self.passes, self.orders, self.opened, self.open_streams = -1, [], 0, 0
         self.warm_since = None
         if not real:
-            self.elapse = self._elapse
+            self.virtual, self.elapse = True, self._elapse
 
     # the control
     def state(self):

@@ -73,6 +73,11 @@ class LinuxCNC(Driver):
 
     # ------------------------------------------------------------------ state
 
+    @property
+    def virtual(self) -> bool:
+        """Whether the machine is simulated, with its own clock."""
+        return self.transport.simulated
+
     def identify(self) -> Identity:
         """Request the identity of the machine."""
         facts = self._query("identify")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from errormotion.datasets import clock
 from errormotion.datasets.clock import steady
 from errormotion.errors import InstrumentError
+from errormotion.plugins.virtual import is_virtual
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -80,7 +81,7 @@ class Controlled:
 
     def __init__(self, controller: Any) -> None:
         self._control = controller
-        self.virtual = hasattr(controller, "elapse")
+        self.virtual = is_virtual(controller)
         self._deadline = float("inf")
         self._checked_at, self._stalled = float("nan"), 0
 

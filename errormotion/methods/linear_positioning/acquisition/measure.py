@@ -23,6 +23,7 @@ from errormotion.methods.linear_positioning.acquisition.instruments import Reade
 from errormotion.methods.linear_positioning.planning.motions import stops
 from errormotion.methods.linear_positioning.planning.targets import Approach, positions, sequence
 from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, SCHEMA, SENSORS
+from errormotion.plugins.virtual import is_virtual, wait
 
 if TYPE_CHECKING:
     from errormotion.methods.linear_positioning.settings import Settings
@@ -85,7 +86,7 @@ class Motion:
         a test without interruption: its errors and its noise depend on what was done before.
         """
         finished = 0 if done is None else int(done.sizes[dim])
-        if hasattr(self.control, "elapse"):
+        if is_virtual(self.control):
             self.origin = float(self.control.state()["time"])
         repeats = done is not None and self.origin is not None and clock.restarted(done, self.origin)
         return (0 if repeats else finished), finished
@@ -116,10 +117,7 @@ class Motion:
 
     def wait(self, seconds: float) -> None:
         """Wait, in the time of the control where it is simulated, else in real time."""
-        if hasattr(self.control, "elapse"):
-            self.control.elapse(seconds)
-        else:
-            time.sleep(seconds)
+        wait(self.control, seconds)
 
 
 class AxisMeasurement(Motion):

@@ -22,6 +22,7 @@ from errormotion.methods.multilateration.acquisition.motions import stations, to
 from errormotion.methods.multilateration.acquisition.scales import Scales
 from errormotion.methods.multilateration.names import station_names, target_names
 from errormotion.methods.multilateration.schema import SCHEMA
+from errormotion.plugins.virtual import is_virtual, wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -54,8 +55,8 @@ def measure_stations(
     Parameters
     ----------
     bench : Bench
-        With a ``laser_tracker`` (``measure``) and a ``controller`` (``move_to``, ``state``). The control of a virtual
-        machine also places the tracker (``set_station``); otherwise the operator is requested to do so.
+        With a ``laser_tracker`` (``measure``) and a ``controller`` (``move_to``, ``state``). The operator is requested
+        to place the tracker; a virtual machine does it.
     settings : Settings
     inputs : mapping
         Not used.
@@ -77,7 +78,7 @@ def measure_stations(
     if done is not None:
         setups.air_reported = _AIR[0] in done
         last = float(np.nanmax(done["reading_time"].values, initial=-np.inf))
-        repeats = hasattr(setups.control, "set_station") and setups.now() < last
+        repeats = is_virtual(setups.control) and setups.now() < last
     for number in setups.sequence:
         for _ in range(1 + setups.measuring.repeats):
             if finished:
@@ -149,13 +150,12 @@ class SetUps:
     def place(self, number: int) -> None:
         """Place the tracker at a station, with the reflector at the first target."""
         self.move(self.order[0])
-        if hasattr(self.control, "set_station"):
-            self.control.set_station([float(x) for x in self.station[number]])
-            return
         position = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(self.station[number] * 1e3))
         self.bench.ask(
             f"Station {self.names[number]}: set up the tracker near {position} in machine coordinates, level it, turn "
-            "the reflector towards it, and acquire the beam."
+            "the reflector towards it, and acquire the beam.",
+            "set_station",
+            position=[float(x) for x in self.station[number]],
         )
 
     def move(self, i: int) -> None:
@@ -184,10 +184,7 @@ class SetUps:
 
     def wait(self, seconds: float) -> None:
         """Wait, in the time of the control where it is simulated, else in real time."""
-        if hasattr(self.control, "elapse"):
-            self.control.elapse(seconds)
-        else:
-            time.sleep(seconds)
+        wait(self.control, seconds)
 
     def now(self) -> float:
         """Return the time of the control, or of this computer, s."""

@@ -13,6 +13,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.clock import age as record_age
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.normal_vector.acquisition import cycle
+from errormotion.plugins.virtual import wait
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -33,7 +34,7 @@ class Warming:
     Parameters
     ----------
     control : controller
-        With ``state``, ``move_to``, ``spindle``, ``stop`` and ``elapse``.
+        With ``state``, ``move_to``, ``spindle`` and ``stop``.
     settings : Settings
     done : Dataset, optional
         Cycles of an interrupted run.
@@ -96,7 +97,7 @@ class Warming:
                 return moves + 1
             if seconds <= cycle.MIN_STEP and len(set(self.settings.moves)) > 1:
                 return moves + 1
-        self.control.elapse(min(until_change, STATE_INTERVAL))
+        wait(self.control, min(until_change, STATE_INTERVAL))
         return moves
 
     def turn(self, speed: float) -> None:
@@ -111,7 +112,7 @@ class Warming:
         self.turn(0.0)
         self.change_tool(self.settings.to_probe)
         if turned and self.settings.settle:
-            self.control.elapse(self.settings.settle)
+            wait(self.control, self.settings.settle)
 
     def change_tool(self, lines: Sequence[str]) -> None:
         """Change the tool by program lines, if there are any."""
@@ -191,7 +192,7 @@ def run(control: Any, text: str) -> None:
             raise InstrumentError(f"The machine is {cause}; this occurred while its program was executed")
         if not state["running"]:
             return
-        control.elapse(PROGRAM_STATE_INTERVAL)
+        wait(control, PROGRAM_STATE_INTERVAL)
 
 
 def fault(state: dict[str, Any]) -> str:

@@ -20,6 +20,7 @@ from errormotion.methods.spindle_drift.acquisition.motions import sphere_centres
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench
+from errormotion.plugins.virtual import is_virtual
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,7 +41,7 @@ def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     static.attrs["sensors_warm"] = warmth(frame, done)
     length = round(scan_seconds(settings.steps, settings.dwell) * frame.rate)
     recorded_samples = 0
-    if hasattr(controller, "elapse"):
+    if is_virtual(controller):
         static.attrs[clock.ORIGIN] = now = float(controller.state()["time"])
         if done is not None and clock.restarted(done, now) and not done["attempt"].values.any():
             recorded_samples, done = int(done.sizes["sample"]), None

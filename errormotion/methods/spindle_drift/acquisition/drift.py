@@ -22,6 +22,7 @@ from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
 from errormotion.methods.spindle_drift.schema import CHANNELS, SCHEMA
 from errormotion.plugins import Bench, Samples
+from errormotion.plugins.virtual import is_virtual, wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -104,7 +105,7 @@ def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
             bench.ask(f"Mount the bar and start the spindle ({speeds or 'no rotation'}).")
         return False
     controller = bench.of_kind("controller")
-    virtual = hasattr(controller, "elapse")
+    virtual = is_virtual(controller)
     if elapsed == 0.0 or virtual:
         controller.mount("bar")
         controller.start(
@@ -114,7 +115,7 @@ def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
             ]
         )
     if virtual and elapsed > 0.0:
-        controller.elapse(elapsed)
+        wait(controller, elapsed)
     return virtual
 
 
