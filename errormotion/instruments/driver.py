@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
 from errormotion.instruments.transports import Transport, open_transport
-from errormotion.instruments.transports.quiet import await_quiet, discard_input
+from errormotion.instruments.transports.base import LINE_ENDS
+from errormotion.instruments.transports.quiet import after_others, await_quiet, discard_input
 from errormotion.plugins import InstrumentInfo, PluginSettings
+
+MAX_OTHER_LINES = 16
+"""Number of lines without the answer after which none is expected any more."""
+
+T = TypeVar("T")
 
 
 class Openable:
@@ -129,6 +135,42 @@ class Driver(Openable):
             self._failed_at, self._timed_out = time.monotonic(), isinstance(error, InstrumentTimeoutError)
             raise
         self._failed_at = None
+
+    def answer_line(
+        self, line: Transport, what: str, read: Callable[[bytes], T | None], *, limit: int, within: float | None = None
+    ) -> T:
+        """Return the answer to a request of a device that answers in lines; lines with other answers are discarded.
+
+        Parameters
+        ----------
+        line : Transport
+        what : str
+            The request, for messages.
+        read : callable
+            Returns the answer in a line, and None if the line answers another request.
+        limit : int
+            Longest line, bytes.
+        within : float, optional
+            Time limit of the answer, s; default: that of the transport for each of up to `MAX_OTHER_LINES` lines.
+
+        Raises
+        ------
+        InstrumentTimeoutError
+            No answer within the time limit.
+        ProtocolError
+            None of `MAX_OTHER_LINES` lines has the answer.
+        """
+        end, others = time.monotonic() + (within or 0.0), 0
+        while within is not None or others < MAX_OTHER_LINES:
+            left = None if within is None else max(end - time.monotonic(), 0.0)
+            try:
+                found = read(line.read_until(LINE_ENDS, limit=limit, timeout=left))
+            except InstrumentTimeoutError as error:
+                raise after_others(error, others, what) from None
+            if found is not None:
+                return found
+            others += 1
+        raise ProtocolError(f"{self.address}: expected an answer to {what}; found {others} other lines")
 
     def resynchronise(self) -> None:
         """Ensure, after a failed exchange, that no answer to an earlier request is read as the next one.

@@ -332,7 +332,7 @@ def test_endless_bytes_are_not_a_controller() -> None:
     device = SimulatedKeyenceLK(parse_address(SIX))
     try:
         device.answer = lambda request: b"hello\r" * 20
-        with pytest.raises(ProtocolError, match="expected the answer 'R0'; found 16 other lines"):
+        with pytest.raises(ProtocolError, match="expected an answer to 'R0'; found 16 other lines"):
             KeyenceLK(device.url, QUICK).open()
     finally:
         device.close()

@@ -11,16 +11,14 @@ from typing import ClassVar
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, LineThermometer, ThermometerSettings
 from errormotion.instruments.transports.base import LINE_ENDS
-from errormotion.instruments.transports.quiet import after_others
 from errormotion.instruments.two_wires import TwoWireSettings
 from errormotion.plugins import Identity, InstrumentInfo
 
 LINE_END = b"\r"
 MAX_LINE_BYTES = 512
-MAX_LATE_LINES = 16
 OPEN_SENSOR = 9999.0  # degC: absolute values from here on mean an open or overrun input
 UNDER_RANGE = "-0000"  # the code of an ADAM for the same
 _VALUE = re.compile(r"[+-]\d+(?:\.\d+)?| {7}")  # blanks: a disabled channel
@@ -210,13 +208,7 @@ class DconTemperature(LineThermometer):
         super().resynchronise()
         line, start = self.transport, f"!{self._unit}".encode("ascii")
         line.write(encode(f"${self._unit}M", with_checksum=self.settings.checksum))
-        for others in range(MAX_LATE_LINES):
-            try:
-                if line.read_until(LINE_ENDS, limit=MAX_LINE_BYTES).startswith(start):
-                    return
-            except InstrumentTimeoutError as error:
-                raise after_others(error, others, f"'${self._unit}M'") from None
-        raise ProtocolError(f"{self.address}: expected an answer that starts with {start!r}; found other lines")
+        self.answer_line(line, f"'${self._unit}M'", lambda text: text.startswith(start) or None, limit=MAX_LINE_BYTES)
 
     def _start_session(self) -> None:
         self.identify()

@@ -12,8 +12,6 @@ from errormotion.instruments import simulators
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.interferometer.attocube_ids import codec
 from errormotion.instruments.interferometer.attocube_ids.settings import IdsSettings, axis_name
-from errormotion.instruments.transports.base import LINE_ENDS
-from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject
 from errormotion.plugins.readings import Environment
 
@@ -86,20 +84,15 @@ class AttocubeIds(Driver):
     def _reply(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to one request, also one that states that it was not executed."""
         self._number += 1
-        method, stray = codec.in_family(method, self._family), 0
-        limit = self.settings.timeout
+        method = codec.in_family(method, self._family)
+
+        def mine(text: bytes) -> codec.Reply | None:
+            found = codec.reply(text)
+            return found if found.number == self._number or (found.number is None and found.refusal) else None
+
         with self.exchange() as line:
             line.write(codec.request(method, self._number, *parameters))
-            deadline = time.monotonic() + limit
-            while True:
-                left = deadline - time.monotonic()
-                try:
-                    found = codec.reply(line.read_until(LINE_ENDS, limit=codec.MAX_REPLY, timeout=max(left, 0.0)))
-                except InstrumentTimeoutError as error:
-                    raise after_others(error, stray, f"'{method}'") from None
-                if found.number == self._number or (found.number is None and found.refusal):
-                    return found
-                stray += 1
+            return self.answer_line(line, f"'{method}'", mine, limit=codec.MAX_REPLY, within=self.settings.timeout)
 
     def _request(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to a request that must succeed."""

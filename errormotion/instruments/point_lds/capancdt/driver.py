@@ -12,11 +12,8 @@ from errormotion.instruments.point_lds.capancdt.blocks import REASONS, block_dec
 from errormotion.instruments.point_lds.capancdt.settings import CapaSettings
 from errormotion.instruments.point_lds.counted import CountedReadings
 from errormotion.instruments.point_lds.counting import CountingDriver, check_range
-from errormotion.instruments.transports.base import LINE_ENDS
-from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
-MAX_OTHER_LINES = 16
 REQUEST_INTERVAL = 0.3
 """Time after which a reading is requested again if the data line was just opened, s."""
 
@@ -188,17 +185,12 @@ class CapaNCDT(CountingDriver):
         """Send a command and return its answer; lines that answer other commands are skipped."""
         with self.exchange() as line:
             line.write(codec.encode(command))
-            for others in range(MAX_OTHER_LINES):
-                try:
-                    answer = line.read_until(LINE_ENDS, limit=codec.MAX_LINE_BYTES)
-                except InstrumentTimeoutError as error:
-                    raise after_others(error, others, f"'${command}'") from None
-                if codec.echoes(command, answer):
-                    break
-            else:
-                raise ProtocolError(
-                    f"{self.address}: expected an answer to '${command}'; found {MAX_OTHER_LINES} other lines"
-                )
+            answer = self.answer_line(
+                line,
+                f"'${command}'",
+                lambda text: text if codec.echoes(command, text) else None,
+                limit=codec.MAX_LINE_BYTES,
+            )
         return codec.answer_to(command, answer)  # a refusal is also an answer
 
     def _average(self, settings: CapaSettings) -> int:

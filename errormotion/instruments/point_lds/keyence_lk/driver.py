@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentError, ProtocolError
 from errormotion.instruments.driver import Driver
 from errormotion.instruments.point_lds.keyence_lk.codec import (
     CONTROLLERS,
@@ -36,11 +36,10 @@ from errormotion.instruments.point_lds.keyence_lk.codec import (
 from errormotion.instruments.point_lds.keyence_lk.settings import LKSettings
 from errormotion.instruments.transports import Transport, open_transport, parse_address
 from errormotion.instruments.transports.base import LINE_ENDS
-from errormotion.instruments.transports.quiet import after_others, discard_input
+from errormotion.instruments.transports.quiet import discard_input
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, Samples
 
 BLOCK_SECONDS = 0.5
-MAX_LATE_LINES = 16
 
 
 class KeyenceLK(Driver):
@@ -224,19 +223,17 @@ class KeyenceLK(Driver):
         """
         self._synchronised = False
         self.transport.write(encode(mode))
-        for others in range(MAX_LATE_LINES):
-            try:
-                line = self.transport.read_until(LINE_ENDS, limit=MAX_LINE_BYTES)
-            except InstrumentTimeoutError as error:
-                raise after_others(error, others, f"'{mode}'") from None
+
+        def entered(line: bytes) -> bool | None:
             text = line.rstrip(b"\r\n").decode("ascii", errors="replace")
             # The error means that the controller was already in this mode.
             if text.endswith((mode, *(f"{ERROR},{mode},{code}" for code in STATE_ERRORS))):
-                self._synchronised = True
-                return
+                return True
             if error_code(mode, text) is not None:
                 parse_answer(mode, text)
-        raise ProtocolError(f"{self.address}: expected the answer '{mode}'; found {MAX_LATE_LINES} other lines")
+            return None
+
+        self._synchronised = self.answer_line(self.transport, f"'{mode}'", entered, limit=MAX_LINE_BYTES)
 
     def _check_controller(self, output: str, unit: str, settings: LKSettings) -> None:
         request = f"SR,{DISPLAY_SETTING},{output}"

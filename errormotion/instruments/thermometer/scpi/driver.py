@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.thermometer.scpi import codec
@@ -12,15 +12,12 @@ from errormotion.instruments.thermometer.scpi.settings import ScpiSettings
 from errormotion.instruments.thermometer.sensors import GOOD, OPEN, OUT_OF_RANGE, LineThermometer
 from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.base import LINE_ENDS
-from errormotion.instruments.transports.quiet import after_others
 from errormotion.plugins import Identity, InstrumentInfo
 
 T = TypeVar("T")
 
 MAX_ERRORS = 32
 """Largest number of entries that are read from the error queue; the units have 10 or 20."""
-MAX_LATE = 32
-"""Largest number of late answers that are discarded before the identity."""
 
 
 class ScpiTemperature(LineThermometer):
@@ -165,15 +162,14 @@ class ScpiTemperature(LineThermometer):
         super().resynchronise()
         line = self.transport
         line.write(codec.encode("*IDN?"))
-        for others in range(MAX_LATE):
+
+        def identity(text: bytes) -> Any:
             try:
-                self._answer(line, "*IDN?", codec.parse_identity)
-            except InstrumentTimeoutError as error:
-                raise after_others(error, others, "'*IDN?'") from None
+                return codec.parse_identity(codec.decode(text))
             except ProtocolError:
-                continue
-            return
-        raise ProtocolError(f"{self.address}: expected the identity of the unit; found {MAX_LATE} other lines")
+                return None
+
+        self.answer_line(line, "'*IDN?'", identity, limit=codec.LONGEST)
 
     @property
     def _serial(self) -> bool:
