@@ -21,6 +21,9 @@ from typing import Any
 
 import xarray as xr
 
+from errormotion.datasets.plausibility import of_raw, with_doubts
+from errormotion.datasets.raw import variant_of
+
 CLOCK, JOINS = "clock", "joins"
 """Attributes of raw data (JSON): the clocks at the last commit, and the interruptions of the record."""
 
@@ -223,8 +226,10 @@ def notes(attrs: Mapping[Any, Any]) -> list[str]:
 
 
 def noted(errors: xr.Dataset, raw: xr.Dataset) -> xr.Dataset:
-    """Return errors whose notes state every interruption of unknown duration of their raw data."""
+    """Return errors whose notes state what their raw data show: interruptions of unknown duration, frozen readings."""
     stated = errors.attrs.get("notes", [])
     before = [note for note in ([stated] if isinstance(stated, str) else stated) if note]
     missing = [note for note in notes(raw.attrs) if note not in before]
-    return errors.assign_attrs(notes=[*before, *missing]) if missing else errors
+    table = variant_of(raw)
+    errors = errors.assign_attrs(notes=[*before, *missing]) if missing else errors
+    return errors if table is None else with_doubts(errors, of_raw(raw, table))

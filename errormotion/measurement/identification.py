@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_deviations, build_errors, provenance
+from errormotion.datasets import build_deviations, build_errors, plausibility, provenance
+from errormotion.datasets.raw import variant_of
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
 from errormotion.estimation.checks import exclusions
@@ -34,6 +35,7 @@ from errormotion.measurement.noise import (
     scatter_of,
     searchable,
     sentence_on,
+    size_of_noise,
     steps_of,
 )
 from errormotion.measurement.observed import Model, Observed, Solved
@@ -74,6 +76,7 @@ def solve(observed: Observed) -> Solved:
             observed = replace(observed, notes=[*observed.notes, sentence_on(observed, rounding)])
             base, factor = scaled(base, factor, rounding.sd), 1.0
             final = fitted(observed, base, final)
+        observed = replace(observed, doubts=[*observed.doubts, size_of_noise(observed, base, factor)])
         white = final if neighbours.phi == 0 else fit(base, refresh=observed.refresh, what=observed.what)
         errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
         solved = Solved(
@@ -206,6 +209,9 @@ def dataset(
     notes, doubts = [*observed.notes], [*observed.doubts]
     if not planned:
         (doubts if solved.scatter.doubtful else notes).append(solved.scatter.note)
+        tables = [table for table in getattr(model, "raw_schemas", ()) if table.id == raw.attrs.get("schema")]
+        table = variant_of(raw, tables) if tables else None
+        doubts += plausibility.of_raw(raw, table) if table else []
     if planned:
         zero = np.where(np.isfinite(datum.errors.value), 0.0, np.nan)
         datum = replace(datum, errors=replace(datum.errors, value=zero), coefficient=0.0 * datum.coefficient)

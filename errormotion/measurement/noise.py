@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import chdtr, chdtri
 
 from errormotion.arrays import Array
+from errormotion.datasets.plausibility import of_noise
 from errormotion.errors import FitError
 from errormotion.estimation.blocks import Noise
 from errormotion.estimation.checks import resolution
@@ -37,6 +38,7 @@ __all__ = [
     "scatter_of",
     "searchable",
     "sentence_on",
+    "size_of_noise",
     "steps_of",
 ]
 
@@ -222,6 +224,14 @@ def sentence_on(observed: Observed, rounding: Rounding) -> str:
         f"{observed.what[:1].upper()}{observed.what[1:]} are multiples of {words(rounding.step)}, with a noise of "
         f"{words(rounding.noise)} before rounding: rounding is a part of the uncertainties."
     )
+
+
+def size_of_noise(observed: Observed, problem: Problem, factor: float) -> str:
+    """Return why the standard deviation of most readings is implausible; "" if it is not, or if it is not known."""
+    if not (observed.noise_increases or problem.noise.stated):
+        return ""
+    variance = np.diagonal(problem.noise.covariance(column(problem.readings).shape), axis1=1, axis2=2)
+    return of_noise(float(np.sqrt(np.nanmedian(variance) * factor)), observed.unit, observed.what)
 
 
 def scaled(problem: Problem, factor: float, added: Array | None = None) -> Problem:

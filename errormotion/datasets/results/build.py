@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
+from errormotion.datasets.plausibility import of_result, with_doubts
 from errormotion.datasets.results.checks import error_violations
 from errormotion.datasets.schemas import CARRIED, DOF, ERROR_ROWS, ERROR_UNITS, INDEX, SCHEMA, SIGN
 from errormotion.errors import DatasetError
@@ -91,7 +92,8 @@ def build_errors(
     doubts : sequence of str, optional
         Further notes: why an uncertainty may be too small. No decision on a tolerance relies on it then.
     measured : mapping, optional
-        Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts are copied to the errors.
+        Attributes of the raw dataset. Those of `schemas.CARRIED` that are texts are copied to the errors. Errors that
+        were measured are compared with those of machine tools (`errormotion.datasets.plausibility`).
     lever_axes : str, optional
         Axes whose travel is a lever of the rotations, such as ``Z``, if the errors are not those of one rigid
         motion.
@@ -165,7 +167,7 @@ def build_errors(
     found = error_violations(ds)
     if found:
         raise DatasetError(f"The result of method '{method}' breaks the schema {SCHEMA}:", found)
-    return ds
+    return ds if measured is None else with_doubts(ds, of_result(ds))
 
 
 @cache
