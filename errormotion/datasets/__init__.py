@@ -8,10 +8,7 @@ from errormotion.datasets.results.accessor import Combination, ErrorMotion
 from errormotion.datasets.results.build import build_deviations, build_errors
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage.disk import load, save
-from errormotion.datasets.unloaded import leave_unloaded
 from errormotion.datasets.validation import validate, violations
-
-leave_unloaded()
 
 __all__ = [
     "DOF",

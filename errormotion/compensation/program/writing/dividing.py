@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.compensation.program.reading.items import LINE
 from errormotion.compensation.program.writing.path import Indices, Path
-from errormotion.compiling import Compiler
 from errormotion.errors import ProgramError
 
 MAX_PIECES = 10_000
 """Maximum number of pieces of one move."""
 
 _POINTS = 200_000  # evaluated at a time
-_compiled = Compiler("the division of lines", seconds=2)
 
 
 class Values(Protocol):
@@ -165,42 +163,47 @@ def _lines(field: _Field, moves: Indices, counts: Indices, start: Array, toleran
     span = path.end[moves] - path.start[moves]
     scaled = offset * path.scale[index, None]
     direction = span / np.linalg.norm(span, axis=1)[:, None]
-    kept = _greedy(np.ascontiguousarray(scaled), first, np.ascontiguousarray(direction), tolerance)
+    kept = _greedy(scaled, first, direction, tolerance)
     return index[kept], u[kept], offset[kept], np.full((int(kept.sum()), 3), np.nan)
 
 
-@_compiled()
-def _greedy(offset: Any, first: Any, direction: Any, tolerance: float) -> Any:
+def _greedy(offset: Array, first: Indices, direction: Array, tolerance: float) -> NDArray[np.bool_]:
     """Return which samples are ends of pieces; each piece has the maximum length within the tolerance."""
-    kept = np.zeros(offset.shape[0], np.bool_)
-    for k in range(first.size - 1):
-        anchor, last = first[k], first[k + 1] - 1
-        while anchor < last:
+    begin, last = first[:-1], first[1:] - 1
+    kept: NDArray[np.bool_] = np.zeros(len(offset), np.bool_)
+    kept[last] = True
+    own = np.repeat(np.arange(begin.size), np.diff(first))
+    share = (np.arange(len(offset)) - begin[own]) / (last - begin)[own]
+    chord = offset[begin[own]] + share[:, None] * (offset[last] - offset[begin])[own]
+    far = _distance(offset - chord, direction[own]) > tolerance
+    for k in np.unique(own[far]):  # the moves that need several pieces
+        anchor = begin[k]
+        while anchor < last[k]:
             good = anchor + 1
-            step = last - anchor  # try the rest first, then halves: smooth corrections need few steps
-            while step > 0:
-                end = min(good + step, last)
-                fits = end > good
-                for j in range(anchor + 1, end):
-                    part = (j - anchor) / (end - anchor)
-                    along = 0.0
-                    square = 0.0
-                    for a in range(3):
-                        d = offset[j, a] - offset[anchor, a] - part * (offset[end, a] - offset[anchor, a])
-                        along += d * direction[k, a]
-                        square += d * d
-                    if square - along * along > tolerance * tolerance:
-                        fits = False
-                        break
-                if fits:
+            step = last[k] - anchor  # try the rest first, then halves: smooth corrections need few steps
+            while step > 0 and good < last[k]:
+                end = min(good + step, last[k])
+                if end > good and _straight(offset[anchor : end + 1], direction[k], tolerance):
                     good = end
                 else:
                     step //= 2
-                if good == last:
-                    break
             kept[good] = True
             anchor = good
     return kept
+
+
+def _straight(offset: Array, direction: Array, tolerance: float) -> bool:
+    """Return whether the corrections (n, 3) along a line follow their chord within the tolerance."""
+    share = np.linspace(0.0, 1.0, len(offset))[:, None]
+    chord = offset[0] + share * (offset[-1] - offset[0])
+    return bool((_distance(offset - chord, direction) <= tolerance).all())
+
+
+def _distance(d: Array, direction: Array) -> Array:
+    """Return the lengths of vectors (n, 3) across the direction of a move (3,) or (n, 3)."""
+    along = np.einsum("ni,ni->n", d, np.broadcast_to(direction, d.shape))
+    found: Array = np.sqrt(np.maximum(np.einsum("ni,ni->n", d, d) - along * along, 0.0))
+    return found
 
 
 def _arcs(
