@@ -8,7 +8,7 @@ that rounding of the numbers in the residuals explains ends it as well: with man
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -88,6 +88,18 @@ class Fit:
         free = len(next(iter(gauge.values()))) if gauge else 0
         return int(self.linear.used.sum()) + priors - unknowns + free
 
+    @cached_property
+    def constant_derivatives(self) -> Mapping[str, Array]:
+        """The stated derivatives of the residuals by constants that are not adjusted, by name."""
+        problem, at = self.problem, self.linear.at
+        if problem.constant_derivatives is None:
+            return {}
+        values = [*at.tables, *problem.constant_tables(at)]
+        rows = [table.rows(value) for table, value in zip(problem.tables, values, strict=True)]
+        return problem.constant_derivatives(
+            problem.y, *problem.named(rows[: len(problem.unknowns)], rows[len(problem.unknowns) :])
+        )
+
     @property
     def leverage(self) -> Array:
         """Diagonal of the hat matrix of the whitened numbers, (n, m): 1 minus the redundancy of each.
@@ -151,11 +163,15 @@ def fit(
     number = Numbering.of(problem)
     at = problem.start if start is None else start
     last = before = np.inf
+    linear: Linear | None = None
     for _ in range(MAX_ITERATIONS):
-        linear = linearised(problem, at, number)
-        normal, step, decrement = _step(linear, what)
-        at = _descended(linear, step)
+        if linear is None or not problem.linear or refresh is not None:
+            linear = linearised(problem, at, number)
+            normal = _factorised(linear, what)
         unit = _unit(linear)
+        step, decrement = _step(linear, normal)
+        linear = _descended(linear, step)
+        at = linear.at
         if refresh is not None:
             problem = refresh(problem, type(problem.unknowns)(*at.tables))
         # The next decrement, if it decreases as slowly as before
@@ -171,41 +187,40 @@ def fit(
             f"decrease the sum of squares by {decrement:.2g}). Check units and the order of the readings"
         )
     # The derivatives before the last step are those at the solution: it was far below the noise.
-    linear = replace(linear, problem=problem, at=at)
-    return Fit(replace(linear, residual=_whitened(linear)), normal)
+    if refresh is not None:
+        linear = replace(linear, problem=problem)
+        linear = replace(linear, residual=_whitened(linear))
+    return Fit(linear, normal)
 
 
-def _step(linear: Linear, what: str) -> tuple[Normal, tuple[Array, Array], float]:
-    """Return the factorised equations, the step (R, p), (q,), and the Newton decrement."""
+def _factorised(linear: Linear, what: str) -> Normal:
+    """Return the factorised normal equations."""
     try:
-        normal, a, b = linear.normal()
+        return linear.factorised()
     except SingularError as error:
         raise _undetermined(linear, error, what) from error
+
+
+def _step(linear: Linear, normal: Normal) -> tuple[tuple[Array, Array], float]:
+    """Return the step (R, p), (q,), and the Newton decrement."""
+    a, b = linear.downhill()
     x, z = normal.solve(a[..., None], b[..., None])
-    decrement = float(np.vdot(a, x[..., 0]) + b @ z[:, 0])
-    return normal, (x[..., 0], z[:, 0]), decrement
+    return (x[..., 0], z[:, 0]), float(np.vdot(a, x[..., 0]) + b @ z[:, 0])
 
 
-def _descended(linear: Linear, step: tuple[Array, Array]) -> Unknown:
-    """Return the unknowns after the step, or after the largest half of it that does not increase the sum."""
+def _descended(linear: Linear, step: tuple[Array, Array]) -> Linear:
+    """Return the residuals after the step, or after the largest half of it that does not increase the sum."""
     before = linear.chi2 + linear.prior_square()
     # Residuals r with errors d of rounding have the sum r'r + 2 r'd.
     most = before * (1 + ROUNDING) + ROUNDING + 2 * np.sqrt(before * linear.rounding)
     fraction = 1.0
     for _ in range(HALVINGS):
-        at = linear.moved(fraction * step[0], fraction * step[1])
-        if _square(linear, at) <= most:
-            return at
+        moved = replace(linear, at=linear.moved(fraction * step[0], fraction * step[1]))
+        moved = replace(moved, residual=_whitened(moved))
+        if moved.chi2 + moved.prior_square() <= most:  # False for NaN
+            return moved
         fraction /= 2
-    return linear.moved(fraction * step[0], fraction * step[1])
-
-
-def _square(linear: Linear, at: Unknown) -> float:
-    """Return the sum of squares at other values of the unknowns, with the weights of the linearisation."""
-    moved = replace(linear, at=at)
-    r = _whitened(moved)
-    found = float(np.vdot(r, r)) + moved.prior_square()
-    return found if np.isfinite(found) else np.inf
+    return moved
 
 
 def _whitened(linear: Linear) -> Array:

@@ -28,6 +28,10 @@ SINGULAR = 1e-13
 """Smallest pivot of the border, scaled to a diagonal of 1, that is not regarded as rounding."""
 
 
+PLAIN = 1e-8
+"""Smallest eigenvalue of a border with a diagonal of 1 from which on its Cholesky factor is as good as eigenvectors."""
+
+
 class SingularError(ValueError):
     """The equations have no unique solution: ``rows`` of the local unknowns, or ``columns`` of the border."""
 
@@ -108,11 +112,37 @@ class Normal:
         """Effect of the r independent parts of the border on each local row, (R, p, r)."""
         return np.asarray(-self.F @ self.root)
 
+    @property
+    def coupling(self) -> Array:
+        """G, (R, p, q)."""
+        return self._G
+
+    @cached_property
+    def coupled(self) -> bool:
+        """Whether any local row is coupled with the border."""
+        return bool(self._G.any())
+
+    @cached_property
+    def chained(self) -> bool:
+        """Whether any local row is coupled with others."""
+        return bool(self._back.any())
+
+    @property
+    def pivots(self) -> Array:
+        """Inverse blocks of T, (R, p, p), where the local rows are not chained."""
+        return self._pivots
+
     def solve(self, a: Array, b: Array) -> tuple[Array, Array]:
         """Return the solutions (R, p, k) and (q, k) for right sides of the same shapes."""
+        y, z = self.eliminated(a, b)
+        return (y - self.F @ z if self.coupled else y), z
+
+    def eliminated(self, a: Array, b: Array) -> tuple[Array, Array]:
+        """Return ``y = T^-1 a`` (R, p, k), with which ``x = y - F z``, and the solution z (q, k) of the border."""
         y = _swept(self._pivots, self._back, a)
-        z = self.root @ (self.root.T @ (b - np.tensordot(self._G, y, axes=((0, 1), (0, 1)))))
-        return y - self.F @ z, z
+        if self.coupled:
+            b = b - np.tensordot(self._G, y, axes=((0, 1), (0, 1)))
+        return y, self.root @ (self.root.T @ b)
 
     def square(self, a: Array, b: Array) -> Array:
         """Return ``(a, b)' C (a, b)`` with the covariance C of all unknowns, (k, k), for (R, p, k) and (q, k)."""
@@ -273,6 +303,20 @@ def _forward(back: Array, right: Array) -> Array:
     return found
 
 
+def _plain_root(S: Array) -> Array | None:
+    """Return a square root of ``S^-1`` by the Cholesky factor L, ``L^-T``; None for a matrix that may be singular.
+
+    The sum of the squares of the inverse factor is the trace of the inverse, larger than 1 over the least eigenvalue.
+    """
+    try:
+        L = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return None
+    inverse, failed = lapack.dtrtri(L, lower=1)
+    certain = not failed and float(np.vdot(inverse, inverse)) < 1 / PLAIN
+    return np.asarray(inverse.T) if certain else None
+
+
 def _root(S: Array, D: Array, gauge: Array | None) -> Array:
     """Return a square root of the covariance of the border, without the gauge."""
     q = len(S)
@@ -281,6 +325,8 @@ def _root(S: Array, D: Array, gauge: Array | None) -> Array:
     diagonal = np.diagonal(D)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = S * scale[:, None] * scale
+    if (gauge is None or not gauge.size) and (root := _plain_root(scaled)) is not None:
+        return scale[:, None] * root
     Z = np.eye(q)
     if gauge is not None and gauge.size:
         # Changes along the gauge, in scaled unknowns; the solution is in their orthogonal complement.

@@ -52,6 +52,9 @@ class Problem:
         readings, (n, m, r); those of the others are differences.
     constant_derivatives : callable, optional
         The same for any of the constants that are not adjusted.
+    linear : bool
+        Whether the derivatives, and the effect of the noise on the residuals, do not depend on the unknowns: they are
+        computed once, and one step solves the problem.
     """
 
     equation: Callable[[Array, Any, Any], Array]
@@ -63,6 +66,7 @@ class Problem:
     gauge: Mapping[str, Array] | None = None
     derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
     constant_derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
+    linear: bool = False
 
     @cached_property
     def y(self) -> Array:
@@ -326,19 +330,28 @@ class Linear:
 
     def normal(self) -> tuple[Normal, Array, Array]:
         """Return the factorised normal equations, and their right sides (R, p) and (q,) for the next step."""
+        return self.factorised(), *self.downhill()
+
+    def factorised(self) -> Normal:
+        """Return the factorised normal equations."""
         number, q = self.numbering, self.numbering.size
         band, G, D = self.sums()
-        a, b = self.gradient(self.residual)
-        problem = self.problem
         if number.local is not None:
-            block = problem.unknowns[number.local]
+            block = self.problem.unknowns[number.local]
             prior = np.where(block.freed, block.information, 1.0)
             band[0] += prior[:, :, None] * np.eye(prior.shape[1])
+        D[np.arange(q), np.arange(q)] += self.border_prior()[0]
+        return factorised(band, G, D, self.gauge())
+
+    def downhill(self) -> tuple[Array, Array]:
+        """Return the right sides (R, p) and (q,) of the normal equations for the next step."""
+        number = self.numbering
+        a, b = self.gradient(self.residual)
+        if number.local is not None:
+            block = self.problem.unknowns[number.local]
             a = np.where(block.freed, a + block.information * (self.at.tables[number.local] - block.start), 0.0)
         prior, offset = self.border_prior()
-        D[np.arange(q), np.arange(q)] += prior
-        normal = factorised(band, G, D, self.gauge())
-        return normal, -a, -(b + prior * offset)
+        return -a, -(b + prior * offset)
 
     def sums(self) -> tuple[list[Array], Array, Array]:
         """Return the sums of products of derivatives: the band of T, G, and D."""

@@ -24,12 +24,13 @@ from errormotion.errors import FitError
 from errormotion.estimation.blocks import Constant, Index, Table
 from errormotion.estimation.derivatives import by_rows, column
 from errormotion.estimation.fit import Fit
-from errormotion.estimation.problem import Problem, by_slot
+from errormotion.estimation.problem import Problem
+from errormotion.estimation.propagation import Seen, effects_of_constants
 
 __all__ = ["Errors", "Places", "Source", "errors_of"]
 
-_CHUNK = 64
-"""Sources whose effects are computed at a time."""
+ROUNDING = 1e-12
+"""Part of a variance that is rounding."""
 _ROWS = 4096
 """Places whose effects are rearranged at a time, in the cache of a core."""
 
@@ -125,7 +126,9 @@ class Errors:
         return found
 
 
-def errors_of(fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "readings") -> Errors:
+def errors_of(
+    fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "readings", sources: bool = True
+) -> Errors:
     """Return the errors of a fit.
 
     Parameters
@@ -136,6 +139,8 @@ def errors_of(fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "r
         Variance factor of the readings; their part only is multiplied by it.
     shared : str
         Group of what the readings contribute to all places together, by the border. With one place it is independent.
+    sources : bool
+        Whether covariance and sources are wanted; otherwise they are 0 and none, as for a trial.
     """
     problem, linear, normal = fit.problem, fit.linear, fit.normal
     values = [*linear.at.tables, *problem.constant_tables(linear.at)]
@@ -158,38 +163,51 @@ def errors_of(fit: Fit, places: Places, *, factor: float = 1.0, shared: str = "r
         raise FitError(
             f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})"
         )
+    if not sources:
+        return Errors(value, np.zeros((*value.shape, value.shape[1])), [])
     its = by_rows(equation, list(tables.values()), [values[k] for k in seen], range(len(seen)))
     J = dict(zip(seen, its, strict=True))
-    own, E, local, index = _by_place(fit, tables, J)
-    sources = list[Source]()
+    its_own, places_see = _by_place(fit, tables, J)
+    own, E = its_own * factor, places_see.border
+    found = list[Source]()
     if E.shape[2]:
         root = normal.root
         information = _prior(fit)
-        C = root @ root.T
-        for name, group, identity, at in _priors(fit):
-            sources.append(Source(name, group, E @ C[:, at] * np.sqrt(information[at]), identity))
-        # S^-1 (S - prior) S^-1 = K K' with K = root (1 - root' prior root)^(1/2)
-        power, vectors = np.linalg.eigh(np.eye(root.shape[1]) - (root.T * information) @ root)
-        K = E @ (root @ (vectors * np.sqrt(np.maximum(power, 0.0)))) * np.sqrt(factor)
+        at = [number for *_, number in _priors(fit)]
+        of_priors = _by_source(E @ (root @ root[at].T * np.sqrt(information[at])))
+        found += [
+            Source(name, group, effect, identity)
+            for (name, group, identity, _), effect in zip(_priors(fit), of_priors, strict=True)
+        ]
+        K = E @ _of_readings(root, information) * np.sqrt(factor)
         if places.count == 1:
-            own = own * factor + K @ np.swapaxes(K, 1, 2)
+            own = own + K @ np.swapaxes(K, 1, 2)
         else:
-            own = own * factor
-            sources += [Source(f"{shared} {k + 1}", shared, K[..., k]) for k in range(K.shape[2]) if K[..., k].any()]
-    else:
-        own = own * factor
-    given: Mapping[str, Array] = {}
-    if problem.constant_derivatives is not None:
-        rows = [table.rows(value) for table, value in zip(problem.tables, values, strict=True)]
-        given = problem.constant_derivatives(problem.y, *problem.named(rows[:count], rows[count:]))
-    for k, constant in enumerate(problem.constants):
-        if not constant.adjust and constant.sources:
-            sources += _of_constant(fit, tables, J, k, local, index, E, given)
-    return Errors(value, own, sources)
+            found += [Source(f"{shared} {k + 1}", shared, each) for k, each in enumerate(_by_source(K)) if each.any()]
+    for k, effects in effects_of_constants(fit, tables, J, places_see):
+        constant = problem.constants[k]
+        names, identities = _named(constant, problem.constants._fields[k])
+        found += [
+            Source(name, constant.group, effect, identity)
+            for name, effect, identity in zip(names, effects, identities, strict=True)
+        ]
+    return Errors(value, own, found)
 
 
-def _by_place(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array]) -> tuple[Array, Array, Array, Index]:
-    """Return own covariances (place, d, d), the effect E of the border (place, d, q), J of the local row, its index."""
+def _of_readings(root: Array, information: Array) -> Array:
+    """Return K (q, r) with ``K K' = S^-1 (S - prior) S^-1``, the part of the readings in the covariance of the border.
+
+    ``K = root (1 - root' prior root)^(1/2)``.
+    """
+    if not information.any():
+        return root
+    power, vectors = np.linalg.eigh(np.eye(root.shape[1]) - (root.T * information) @ root)
+    kept = power > ROUNDING
+    return np.asarray(root @ (vectors[:, kept] * np.sqrt(power[kept])))
+
+
+def _by_place(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array]) -> tuple[Array, Seen]:
+    """Return own covariances (place, d, d), and what places see of the unknowns."""
     problem, linear, normal = fit.problem, fit.linear, fit.normal
     number, q = linear.numbering, linear.numbering.size
     count, d = next(iter(J.values())).shape[:2]
@@ -206,17 +224,22 @@ def _by_place(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array]) -> 
             index = tables[k].index2[:, 0]
             local = each[:, :, 0] * block.freed[index][:, None, :]
             own = local @ normal.own[index] @ np.swapaxes(local, 1, 2)
-            E[..., :q] -= local @ normal.F[index]
+            if normal.coupled:
+                E[..., :q] -= local @ normal.F[index]
             continue
         columns = number.border[k][tables[k].index2].reshape(count, -1)
         flat = each.reshape(count, d, -1)
+        same = count > 0 and bool((columns == columns[0]).all())
         for j in range(flat.shape[2]):
-            E[np.arange(count), :, columns[:, j]] += flat[:, :, j]
+            if same:
+                E[:, :, columns[0, j]] += flat[:, :, j]
+            else:
+                E[np.arange(count), :, columns[:, j]] += flat[:, :, j]
     for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
         at = len(problem.unknowns) + k
         if at in J:
             E[..., its] += np.einsum("pdwc,pwcz->pdz", J[at], constant.factor[tables[at].index2])
-    return own, E[..., :q], local, index
+    return own, Seen(local, index, E[..., :q])
 
 
 def _prior(fit: Fit) -> Array:
@@ -244,53 +267,6 @@ def _named(constant: Constant, name: str) -> tuple[Sequence[str], Sequence[str]]
     k, base = constant.sources, constant.group or name
     names = constant.names or ([base] if k == 1 else [f"{base} {j + 1}" for j in range(k)])
     return names, constant.identity or [""] * k
-
-
-def _of_constant(
-    fit: Fit,
-    tables: Mapping[int, Table],
-    J: Mapping[int, Array],
-    k: int,
-    local: Array,
-    index: Index,
-    E: Array,
-    given: Mapping[str, Array],
-) -> list[Source]:
-    """Return the sources of a constant that is taken as it is."""
-    problem, linear = fit.problem, fit.linear
-    constant: Constant = problem.constants[k]
-    name = problem.constants._fields[k]
-    at = len(problem.unknowns) + k
-    if name in given:
-        R = by_slot(given[name], constant)
-    else:
-        values = [*linear.at.tables, *problem.constant_tables(linear.at)]
-        R = by_rows(lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, [at])[0]
-    white = linear.whitener @ np.where(linear.used[:, :, None, None], R, 0.0).reshape(*linear.used.shape, -1)
-    names, identities = _named(constant, name)
-    found = []
-    for first in range(0, constant.sources, _CHUNK):
-        part = slice(first, first + _CHUNK)
-        factor = constant.factor[..., part]
-        effect = np.zeros((len(local), E.shape[1], factor.shape[2]))
-        if at in J:
-            effect += np.einsum("pdwc,pwcz->pdz", J[at], factor[tables[at].index2])
-        if white.any():
-            if constant.common:
-                change = white @ factor[constant.index2[0]].reshape(-1, factor.shape[2])
-            else:
-                change = white @ factor[constant.index2].reshape(len(white), -1, factor.shape[2])
-            a, b = linear.gradient(change)
-            x, z = fit.normal.solve(-a, -b)
-            effect += E @ z
-            if linear.numbering.local is not None:
-                # x = T^-1 (-a - G z): E z contains -F z already
-                effect += local @ (x[index] + fit.normal.F[index] @ z)
-        found += [
-            Source(names[first + j], constant.group, each, identities[first + j])
-            for j, each in enumerate(_by_source(effect))
-        ]
-    return found
 
 
 def _by_source(effect: Array) -> Array:

@@ -213,6 +213,7 @@ def problem_of(readings: Readings, spreads: Sequence[Scatter]) -> Problem:
         constants=_constants(readings, np.zeros(a.size, dtype=np.intp)),
         noise=Noise(sd=np.maximum(sd, EQUAL)),
         derivatives=lambda *_: derivatives,
+        linear=True,
     )
 
 

@@ -246,6 +246,7 @@ def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
         ),
         noise=Noise(sd=np.nan_to_num(sd, nan=spread), stated=False),
         derivatives=lambda *_: derivatives,
+        linear=True,
     )
     try:
         return components(problem, noise=True)
