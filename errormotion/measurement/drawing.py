@@ -20,9 +20,10 @@ from errormotion.datasets import provenance
 from errormotion.estimation.checks.correlated import coloured
 from errormotion.estimation.derivatives import along, column
 from errormotion.estimation.problem import Problem
-from errormotion.measurement.identification import Solved, dataset, solve
+from errormotion.kinematics.iso import DOF
+from errormotion.measurement.identification import Solved, dataset, solve, values_of
 from errormotion.measurement.observed import Model, Observed, as_expected
-from errormotion.plugins import MethodInfo, Redraw, Redrawing
+from errormotion.plugins import MethodInfo, Redraw, Redrawing, replaced
 
 __all__ = ["READINGS", "independent_draws", "moved", "redrawing", "simulate", "standard_draw"]
 
@@ -31,10 +32,15 @@ READINGS = "readings"
 
 
 def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> Redrawing:
-    """Return the readings of raw data and all sources of the model; each trial is a fit of arrays."""
+    """Return the readings of raw data and all sources of the model; each trial is a fit of arrays, of values only."""
     solved = solve(model.observe(raw, settings))
+    result = dataset(model, solved, raw, info, provenance.make(settings, None, None, steps=["trial"]))
+    result = result[[*DOF, *({"deviation"} & set(result))]]
     observed, problem = solved.observed, solved.observed.problem
     readings = column(problem.readings)
+    # A trial has the noise that was found, and does not examine its readings.
+    frozen = replace(as_expected(observed), correlation=observed.correlation, resolution=0.0)
+    weighed = replace(problem, noise=replace(solved.white.problem.noise, stated=True))
     start = xr.Dataset({READINGS: (("reading", "number"), readings)})
     root, freedom = _noise(solved)
     sources: dict[str, Redraw] = {}
@@ -49,14 +55,15 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
     groups = {source.group for source in solved.relative.errors.sources}
     of_readings = {observed.shared, *((observed.datum.group,) if observed.datum is not None else ())}
     sources[READINGS] = Redraw(noisy, groups=tuple(sorted(of_readings & groups)), own=True)
-    for name, number in independent_draws(problem).items():
+    numbers = independent_draws(problem)
+    for name, number in numbers.items():
         sources[name] = Redraw(standard_draw(name, number), groups=(name,) if name in groups else ())
 
-    def trial(data: xr.Dataset, its: Any) -> xr.Dataset:
-        drawn = {name: np.asarray(data[name].values) for name in independent_draws(problem) if name in data}
-        changed = moved(problem, data[READINGS].values.reshape(problem.readings.shape), drawn)
-        origin = provenance.make(its, None, None, steps=["trial"])
-        return dataset(model, solve(replace(observed, problem=changed, reliability=False)), raw, info, origin)
+    def trial(data: xr.Dataset, _settings: Any) -> xr.Dataset:
+        drawn = {name: np.asarray(data[name].values) for name in numbers if name in data}
+        changed = moved(weighed, data[READINGS].values.reshape(problem.readings.shape), drawn)
+        found = solve(replace(frozen, problem=changed), sources=False, start=solved.fit.linear.at)
+        return replaced(result, values_of(found))
 
     return Redrawing(start, settings, sources, identify=trial)
 

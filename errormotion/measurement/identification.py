@@ -21,7 +21,7 @@ from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.problem import Problem
+from errormotion.estimation.problem import Problem, Unknown
 from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF
@@ -41,11 +41,20 @@ from errormotion.measurement.noise import (
 from errormotion.measurement.observed import Model, Observed, Solved
 from errormotion.plugins import MethodInfo
 
-__all__ = ["Solved", "dataset", "identify", "of_readings", "solve"]
+__all__ = ["Solved", "dataset", "identify", "of_readings", "solve", "values_of"]
 
 
-def solve(observed: Observed) -> Solved:
+def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = None) -> Solved:
     """Return the solution of a problem.
+
+    Parameters
+    ----------
+    observed : Observed
+    sources : bool
+        Whether covariance and sources of the errors are wanted, and what readings that are all used look like; a trial
+        needs values only.
+    start : Unknown, optional
+        Where the fit starts, such as the solution for similar readings.
 
     Raises
     ------
@@ -55,7 +64,7 @@ def solve(observed: Observed) -> Solved:
     try:
         given = observed.problem
         observed = replace(observed, resolution=steps_of(observed))
-        observed, found, search = _cleaned(observed)
+        observed, found, search = _cleaned(observed if sources else replace(observed, examined=None), start)
         neighbours = neighbours_of(observed, found)
         observed = replace(
             observed,
@@ -77,8 +86,8 @@ def solve(observed: Observed) -> Solved:
             base, factor = scaled(base, factor, rounding.sd), 1.0
             final = fitted(observed, base, final)
         observed = replace(observed, doubts=[*observed.doubts, size_of_noise(observed, base, factor)])
-        white = final if neighbours.phi == 0 else fit(base, refresh=observed.refresh, what=observed.what)
-        errors = errors_of(final, observed.places, factor=factor, shared=observed.shared)
+        white = final if neighbours.phi == 0 or not sources else fitted(replace(observed, order=None), base, final)
+        errors = errors_of(final, observed.places, factor=factor, shared=observed.shared, sources=sources)
         solved = Solved(
             observed=observed,
             fit=final,
@@ -88,16 +97,17 @@ def solve(observed: Observed) -> Solved:
             given=given,
             cleaned=search,
             rounding=rounding,
+            propagated=sources,
         )
         return solved if observed.finish is None else observed.finish(solved)
     except FitError as error:
         raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
 
 
-def _cleaned(observed: Observed) -> tuple[Observed, Fit, Cleaned | None]:
+def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, Cleaned | None]:
     """Return what was observed without outliers, with a note on each, the fit, and what was found."""
     if not observed.robust:
-        plain = fit(observed.problem, refresh=observed.refresh, what=observed.what)
+        plain = fit(observed.problem, refresh=observed.refresh, what=observed.what, start=start)
         if observed.examined is not None:
             observed = replace(
                 observed, examined=None, doubts=[*observed.doubts, *_examined(observed, observed.examined)]
@@ -254,6 +264,15 @@ def dataset(
             **common,
         )
     return found.assign_attrs(observed.attrs)
+
+
+def values_of(solved: Solved) -> dict[str, Array]:
+    """Return the values of a solution by the name of their variable, in the dims of the result."""
+    observed, value = solved.observed, solved.relative.errors.value
+    shape = _shape(observed)
+    if observed.sensitivity is not None:
+        return {"deviation": value[:, 0].reshape(shape)}
+    return dict(zip(DOF, np.moveaxis(_placed(value, observed, shape), -1, 0), strict=True))
 
 
 def of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:

@@ -102,7 +102,7 @@ class Observed:
         What depends on the readings that are used; see there. ``problem`` fulfils it.
     finish : callable, optional
         From the solution to one with whatever else follows from it: names, notes and variables of the result, or other
-        errors. Called after each solution, also that of a plan and of a trial.
+        errors. Called after each solution, also that of a plan and of a trial (`Solved.propagated`).
     extras : mapping of str to DataArray
         Further variables of the result that follow from the raw data.
     attributes : mapping
@@ -183,6 +183,9 @@ class Solved:
         The problem with all readings.
     cleaned : Cleaned, optional
         What was excluded; None if nothing was searched.
+    propagated : bool
+        Whether the errors have their covariance and sources. Those of a trial have values only: `Observed.finish` then
+        only does what changes these.
     """
 
     observed: Observed
@@ -193,6 +196,7 @@ class Solved:
     given: Problem
     cleaned: Cleaned | None = None
     rounding: Rounding | None = None
+    propagated: bool = True
 
     @property
     def fit_factor(self) -> float:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.random import SeedSequence
 from pydantic import Field
 
 from errormotion import datasets
@@ -241,8 +242,12 @@ def test_what_follows_from_a_solution_is_part_of_result_plan_and_trials() -> Non
     class Further(Drift):
         def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
             def finish(solved: Solved) -> Solved:
-                largest = xr.DataArray(float(np.nanmax(solved.relative.errors.value)), attrs={"units": "m"})
-                return replace(solved, observed=replace(solved.observed, extras={"largest": largest}))
+                errors = solved.relative.errors
+                assert solved.propagated == bool(errors.sources)
+                shifted = replace(errors, value=errors.value + 1e-3)
+                largest = xr.DataArray(float(np.nanmax(shifted.value)), attrs={"units": "m"})
+                observed = replace(solved.observed, extras={"largest": largest})
+                return replace(solved, observed=observed, relative=replace(solved.relative, errors=shifted))
 
             return replace(super().observe(raw, settings), finish=finish)
 
@@ -252,7 +257,26 @@ def test_what_follows_from_a_solution_is_part_of_result_plan_and_trials() -> Non
     assert float(errors["largest"]) == float(errors["EZ"].max())
     assert "largest" in method.plan(SETTINGS)
     redrawing = redrawing_of(method, raw, SETTINGS, errors)
-    assert "largest" in trial(method, redrawing, np.random.SeedSequence(7))
+    plain = trial(METHOD, redrawing_of(METHOD, raw, SETTINGS, METHOD.identify(raw, SETTINGS)), SeedSequence(7))
+    found = trial(method, redrawing, SeedSequence(7))
+    assert found["EZ"].values == pytest.approx(plain["EZ"].values + 1e-3, abs=1e-12)
+
+
+def test_a_trial_has_the_values_of_the_identification_of_its_readings() -> None:
+    """Of values only, from the solution of the measured readings: the same ones as by all of the identification."""
+    raw, _ = METHOD.simulate(SETTINGS, 1)
+    errors = METHOD.identify(raw, SETTINGS)
+    drawn = redrawing_of(METHOD, raw, SETTINGS, errors)
+    draw = drawn.sources[READINGS].draw
+    assert draw is not None
+    assert drawn.identify is not None
+    changed, _ = draw(drawn.raw, SETTINGS, np.random.default_rng(3))
+    found = drawn.identify(changed, SETTINGS)
+    y = changed[READINGS].values.reshape(raw["reading"].shape)
+    assert np.abs(y - raw["reading"].values).max() > SETTINGS.noise
+    again = METHOD.identify(raw.assign(reading=raw["reading"].copy(data=y)), SETTINGS)
+    u = np.sqrt(errors["covariance"].values[:, 2, 2])
+    assert np.abs(found["EZ"].values - again["EZ"].values).max() < 1e-6 * u.max()
 
 
 def test_an_error_along_one_direction_is_a_deviation() -> None:

@@ -254,6 +254,7 @@ def problem_of(circles: Circles, settings: Settings, places: int, decay: float, 
             temperature=constant("temperature of the bar", 0.0, circles.known[2]),
         ),
         noise=Noise(sd=np.full(known.size, noise)),
+        linear=True,
     )
     return Sectors(problem, count.reshape(2, places), noise, drifts)
 

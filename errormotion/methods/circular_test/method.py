@@ -149,7 +149,7 @@ def _finished(solved: Solved, *, circles: Circles, sectors: Sectors, settings: A
     observed, relative = solved.observed, solved.relative
     if settings.noise == "auto":  # `circles` says what the scatter within sectors means
         solved = replace(solved, scatter=replace(solved.scatter, verdict=Verdict.CONSISTENT, note=""))
-    if not observed.reliability:
+    if not solved.propagated:
         return solved
     errors, count = relative.errors, sectors.count.ravel()
     shared = np.array([each.effect[:, 0] for each in errors.sources if each.group != CENTRE]).reshape(-1, count.size)

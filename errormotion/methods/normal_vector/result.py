@@ -116,7 +116,10 @@ def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequen
     anchor = fit.constants.centre if seen.touched else fit.unknowns.reach
     measured_reach = problem.unknowns.reach.freed
     reach = np.where(measured_reach, fit.unknowns.reach, np.nan).reshape(len(data.names), -1)
-    best = _compressed(solved.relative.errors, excluded.lost)
+    best = solved.relative.errors
+    best = _compressed(best, excluded.lost) if solved.propagated else _unknown(best, excluded.lost)
+    if not solved.propagated and settings.procedure == "rigid":
+        return replace(solved, relative=replace(solved.relative, errors=best))
     other, why = _published(probing, solved, seen, excluded, anchor, reach, settings, noise)
     if settings.procedure == "normals" and other is None:
         raise MethodError("procedure = normals: " + why)
@@ -142,6 +145,13 @@ def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequen
         },
     )
     return replace(solved, observed=observed, relative=replace(solved.relative, errors=chosen))
+
+
+def _unknown(errors: Errors, lost: NDArray[np.intp]) -> Errors:
+    """Return values that are NaN for lost cycles."""
+    value = errors.value.copy()
+    value[lost] = np.nan
+    return replace(errors, value=value)
 
 
 def _compressed(errors: Errors, lost: NDArray[np.intp]) -> Errors:

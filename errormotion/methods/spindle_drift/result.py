@@ -91,7 +91,7 @@ class Result:
     def finish(self, solved: Solved) -> Solved:
         """Return a solution whose instants of the reference state share its noise, with all further results."""
         errors = solved.relative.errors
-        of_reference = self._of_reference(solved)
+        of_reference = self._of_reference(solved) if solved.propagated else []
         sources = [*of_reference, *(source for source in errors.sources if source.group != REFERENCE)]
         m = self.reference.size
         # What each mean does not share with the mean of all; a single one is 0 by definition.
@@ -105,7 +105,7 @@ class Result:
         names = [source.name for source in sources if source.group == REFERENCE]
         observed = solved.observed
         observed = replace(observed, attributes={**observed.attributes, "reference_sources": names})
-        if not self._brief:
+        if solved.propagated and not self._brief:
             found = self._iso(errors)
             extras = self._extras(solved.fit.residual[:-1].T) | found.as_extras(len(sources))
             attrs = {**observed.attrs, "iso_test": found.test, "iso_temperature_sensor": found.sensor}

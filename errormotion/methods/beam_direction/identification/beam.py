@@ -202,6 +202,8 @@ class _Result:
         data, value, total = self.data, errors.value, errors.covariance
         p0, u0 = data.nominal_origin[None], data.nominal_direction[None]
         twist, covariance = beam_errors(p0, u0, value[:, :3], value[:, 3:], total)
+        if not solved.propagated:
+            return replace(solved, relative=replace(solved.relative, errors=Errors(twist, covariance, [])))
         chart = error_jacobian(u0, value[:, 3:])[0]
         sources = [
             Source(one.name, one.group, np.nan_to_num(one.effect) @ chart.T, one.identity) for one in errors.sources

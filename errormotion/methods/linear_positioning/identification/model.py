@@ -316,6 +316,8 @@ def _finished(solved: Solved, names: Sequence[str], trends: Sequence[Trend | Non
 
     The noise has been estimated from the same readings, and is not compared with them again.
     """
+    if not solved.propagated:
+        return solved
     errors = solved.relative.errors
     u = np.sqrt(np.einsum("pdd->pd", errors.covariance))
     block = solved.fit.problem.unknowns.run

@@ -190,6 +190,7 @@ def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observ
                 )
             ),
             noise=Noise(sd=np.broadcast_to(np.maximum(evaluated.noise, EQUAL), y.shape)),
+            linear=True,
         ),
         places=Places(lambda x, _: x.error + known, len(known)),
         recorded=("end_deviation", ("cycle", "end", "freedom")),
