@@ -72,9 +72,12 @@ class ErrormotionEngine(BackendEntrypoint):
 
 def _path(given: Any, unknown: Mapping[str, Any]) -> Path:
     if unknown:
-        raise DatasetError(f"The engine 'errormotion' has no options; found {', '.join(sorted(unknown))}")
+        raise DatasetError(
+            f"The engine 'errormotion' has no options; found {', '.join(sorted(unknown))}",
+            code="engine.options.unknown",
+        )
     if not isinstance(given, (str, os.PathLike)):
-        raise DatasetError(f"Expected the path of a dataset; found {type(given).__name__}")
+        raise DatasetError(f"Expected the path of a dataset; found {type(given).__name__}", code="engine.path.form")
     return Path(given)
 
 

@@ -38,7 +38,8 @@ def checked_scheduler(wanted: str) -> str:
     if "://" not in wanted and wanted not in SCHEDULERS:
         raise RunError(
             f"Expected {', '.join(SCHEDULERS)} or the address of a Dask scheduler, such as tcp://host:8786; "
-            f"found '{wanted}'"
+            f"found '{wanted}'",
+            code="scheduler.unknown",
         )
     return wanted
 
@@ -82,7 +83,10 @@ class Workers:
     def __init__(self, scheduler: str, workers: int | None, version: str) -> None:
         self.scheduler = checked_scheduler(scheduler)
         if workers is not None and (workers < 1 or scheduler not in SCHEDULERS):
-            raise RunError(f"--workers: expected 1 or more, and no number for a cluster; found {workers}")
+            raise RunError(
+                f"--workers: expected 1 or more, and no number for a cluster; found {workers}",
+                code="scheduler.workers.count",
+            )
         self.count = 1 if scheduler == "sync" else workers or CPU_COUNT
         self._version = version
         self._executor: Executor | None = None
@@ -188,7 +192,9 @@ def _connected(address: str, version: str) -> Client:
     try:
         client = Client(address, timeout=CLUSTER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise RunError(f"{address}: expected a Dask scheduler; none answers ({error})") from error
+        raise RunError(
+            f"{address}: expected a Dask scheduler; none answers ({error})", code="scheduler.no_answer"
+        ) from error
     try:
         _check_workers(client, address, version)
     except BaseException:
@@ -203,7 +209,8 @@ def _check_workers(client: Client, address: str, version: str) -> None:
         client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
     except TimeoutError as error:
         raise RunError(
-            f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'"
+            f"{address}: the Dask scheduler has no workers; start some with 'dask worker {address}'",
+            code="scheduler.no_workers",
         ) from error
     versions: Any = client.get_versions(packages=["errormotion"])
     wrong = [
@@ -213,12 +220,14 @@ def _check_workers(client: Client, address: str, version: str) -> None:
     ]
     if wrong:
         raise RunError(
-            f"{address}: expected errormotion {version} on every worker; {', '.join(wrong)}. Install it there."
+            f"{address}: expected errormotion {version} on every worker; {', '.join(wrong)}. Install it there.",
+            code="scheduler.version.differs",
         )
 
 
 def _missing(package: str) -> RunError:
     return RunError(
         f"Parallel execution needs the package '{package}', which is not installed: "
-        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' executes one task after another."
+        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' executes one task after another.",
+        code="package.missing",
     )

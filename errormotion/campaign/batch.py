@@ -54,6 +54,8 @@ class Outcome:
         The error dataset; None after a failure.
     reason : str
         Cause of the failure; empty without one.
+    code : str
+        Code of the error; empty without one.
     seconds : float
         Duration, s.
     stepped_over : bool
@@ -68,6 +70,7 @@ class Outcome:
     seconds: float = 0.0
     stepped_over: bool = False
     traceback: str = field(default="", repr=False)
+    code: str = ""
 
 
 class Task(NamedTuple):
@@ -129,7 +132,10 @@ def identify_runs(
     """
     name, note = choose_scheduler(scheduler)
     if workers is not None and (workers < 1 or name not in SCHEDULERS):
-        raise RunError(f"--workers: expected 1 or more, and no number for a cluster; found {workers}")
+        raise RunError(
+            f"--workers: expected 1 or more, and no number for a cluster; found {workers}",
+            code="scheduler.workers.count",
+        )
     if note:
         log.warning("%s", note)
     method = plugins.get("methods", method_id)
@@ -139,7 +145,9 @@ def identify_runs(
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunError(f"{out}: expected a folder that exists or can be created; {error.strerror}") from error
+        raise RunError(
+            f"{out}: expected a folder that exists or can be created; {error.strerror}", code="folder.not_created"
+        ) from error
     common = (method.info.id, method.info.version, settings.model_dump_json(), __version__)
     tasks = [
         Task(str(raw_of(raw).resolve()), str(out.resolve() / f"{name}.nc"), *common)
@@ -200,7 +208,10 @@ def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]
                 seen.add(path.resolve())
                 yield path, reason
     if not seen:
-        raise RunError("Expected at least one raw dataset, run folder or folder of run folders; found none")
+        raise RunError(
+            "Expected at least one raw dataset, run folder or folder of run folders; found none",
+            code="batch.no_datasets",
+        )
 
 
 def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
@@ -221,7 +232,10 @@ def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
             resume = f"continue it with 'errormotion run --resume --runs {folder}'"
             found.append((path, f"{path}: the measurement is not complete ({data['status']}); {resume}"))
     if not found:
-        raise RunError(f"{folder}: expected runs of the method '{method_id}'; found {', '.join(sorted(others))}")
+        raise RunError(
+            f"{folder}: expected runs of the method '{method_id}'; found {', '.join(sorted(others))}",
+            code="batch.method.other",
+        )
     return found
 
 
@@ -236,7 +250,10 @@ def _names(raws: Sequence[Path]) -> list[str]:
             return names
         if all(depth[k] >= len(parts[k]) for k in alike):
             same = " and ".join(str(raws[k]) for k in alike if names[k] == names[alike[0]])
-            raise RunError(f"{same}: both results would be named {names[alike[0]]}.nc; identify them into two folders")
+            raise RunError(
+                f"{same}: both results would be named {names[alike[0]]}.nc; identify them into two folders",
+                code="batch.names.alike",
+            )
         for k in alike:
             depth[k] += 1
 
@@ -247,7 +264,7 @@ def _work(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Call
     count = max(1, min(workers or CPU_COUNT, len(tasks))) if local else None
 
     def lost(number: int, reason: str) -> None:
-        done(Outcome(Path(tasks[number].raw), reason=reason))
+        done(Outcome(Path(tasks[number].raw), reason=reason, code="batch.task.lost"))
 
     with Workers(scheduler, count, __version__) as pool:
         pool.run(_identify, tasks, lambda _, outcome: done(outcome), lost)
@@ -256,16 +273,17 @@ def _work(tasks: Sequence[Task], scheduler: str, workers: int | None, done: Call
 def _identify(raw: str, out: str, method_id: str, method_version: str, settings: str, version: str) -> Outcome:
     """Execute one task; every error becomes an outcome."""
     start = time.perf_counter()
-    reason = trace = ""
+    reason = trace = code = ""
     stepped_over = False
     try:
         stepped_over = _identify_or_raise(Task(raw, out, method_id, method_version, settings, version))
     except ErrormotionError as error:
-        reason = str(error)
+        reason, code = str(error), error.code
     except Exception as error:  # noqa: BLE001 - a plugin that fails on one run must not affect the others
+        code = "error.internal"
         reason, trace = f"{type(error).__name__}: {error}", tracebacks.format_exc()
     errors = None if reason else Path(out)
-    return Outcome(Path(raw), errors, reason, time.perf_counter() - start, stepped_over, trace)
+    return Outcome(Path(raw), errors, reason, time.perf_counter() - start, stepped_over, trace, code)
 
 
 def _identify_or_raise(task: Task) -> bool:
@@ -276,7 +294,10 @@ def _identify_or_raise(task: Task) -> bool:
         (f"the method {task.method_id}", task.method_version, method.info.version),
     ):
         if wanted != found:
-            raise RunError(f"{platform.node()}: expected {what} in version {wanted}; found {found}. Install it there.")
+            raise RunError(
+                f"{platform.node()}: expected {what} in version {wanted}; found {found}. Install it there.",
+                code="package.version.differs",
+            )
     settings = method.Settings.model_validate_json(task.settings)
     plain = provenance.plain(settings.model_dump(mode="json"))
     path = Path(task.out)
@@ -288,7 +309,8 @@ def _identify_or_raise(task: Task) -> bool:
                 return True
             raise DatasetError(
                 f"{path}: already exists, from other raw data, other settings or another version of the method, and "
-                "a result is never overwritten; specify another folder with --out"
+                "a result is never overwritten; specify another folder with --out",
+                code="result.exists",
             )
         with _lock if one_thread_at_a_time() else nullcontext(), explained(task.raw, dataset):
             errors = noted(method().identify(dataset, settings), dataset)

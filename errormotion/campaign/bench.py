@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from errormotion.campaign.files import BenchInstrument, BenchPlan
 from errormotion.campaign.storage.journal import cause_of
-from errormotion.errors import BenchError, ErrormotionError
+from errormotion.errors import BenchError, ErrormotionError, code_of
 from errormotion.instruments.simulators.virtual_world.described import describe
 from errormotion.plugins import Identity
 from errormotion.plugins.kind_registry import changes_machine
@@ -26,6 +26,7 @@ class Answer:
     driver: Any = None
     identity: Identity | None = None
     error: str = ""
+    code: str = ""
 
     def line(self) -> str:
         """Return the result as one line of text."""
@@ -101,7 +102,7 @@ class OpenBench:
             try:
                 driver = each.driver(each.address, each.settings)
             except ErrormotionError as error:
-                raise BenchError(f"instrument '{each.name}': {error}") from error
+                raise BenchError(f"instrument '{each.name}': {error}", code=error.code) from error
             bench._bind(driver)
             bench.answers.append(Answer(each, driver))
         return bench
@@ -123,7 +124,9 @@ class OpenBench:
         if failed:
             self.close()
             head = f"Bench '{self.plan.name}': {len(failed)} of {len(self.answers)} instruments could not be opened."
-            raise BenchError("\n".join([head, *tree([answer.line() for answer in self.answers])]))
+            raise BenchError(
+                "\n".join([head, *tree([answer.line() for answer in self.answers])]), code="bench.not_opened"
+            )
 
     def try_open(self) -> None:
         """Open all instruments; ``answers`` contains the failures."""
@@ -135,7 +138,7 @@ class OpenBench:
                 identity = connect(driver)
             except Exception as error:
                 log.exception("instrument %s could not be opened", instrument.name)
-                self.answers.append(Answer(instrument, error=cause_of(error)))
+                self.answers.append(Answer(instrument, error=cause_of(error), code=code_of(error, "error.internal")))
             else:
                 self.answers.append(Answer(instrument, driver, identity))
 
@@ -151,7 +154,8 @@ class OpenBench:
         elif changes_machine(driver):
             raise BenchError(
                 f"The driver '{driver.info.id}' can move or change a machine and does not check limits: it has no "
-                "method 'bound'. 'errormotion plugins check' lists the requirements for such a driver"
+                "method 'bound'. 'errormotion plugins check' lists the requirements for such a driver",
+                code="bench.driver.no_limits",
             )
 
     def close(self) -> None:
@@ -204,11 +208,13 @@ class OpenBench:
             names = ", ".join(answer.instrument.name for answer in found)
             raise BenchError(
                 f"Bench '{self.plan.name}': expected one {kind}; found {names}. Choose one in the test: "
-                f'instruments = {{ {kind} = "{found[0].instrument.name}" }}.'
+                f'instruments = {{ {kind} = "{found[0].instrument.name}" }}.',
+                code="bench.instruments.several",
             )
         raise BenchError(
             f"Bench '{self.plan.name}': expected a {kind}; found {', '.join(self.plan.kinds)}. "
-            f"Add one to {self.plan.source}."
+            f"Add one to {self.plan.source}.",
+            code="bench.instrument.missing",
         )
 
     def all_of_kind(self, kind: str) -> dict[str, Any]:
@@ -227,7 +233,8 @@ class OpenBench:
             return
         if self._ask is None:
             raise BenchError(
-                f"A request to the operator cannot be shown ({message}). Run the command in a terminal, or with --yes."
+                f"A request to the operator cannot be shown ({message}). Run the command in a terminal, or with --yes.",
+                code="operator.request.not_shown",
             )
         log.info("request to the operator: %s", message)
         self._ask(message)

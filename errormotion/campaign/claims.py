@@ -201,7 +201,9 @@ def _new_file(folder: Path, ending: str, wanted: tuple[Use, ...], what: str, not
                 os.fchmod(descriptor, 0o644)  # every user reads it, whatever the mask
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
             except OSError as error:
-                raise RunError(f"{path}: the instruments cannot be claimed: {error.strerror}") from error
+                raise RunError(
+                    f"{path}: the instruments cannot be claimed: {error.strerror}", code="claim.not_written"
+                ) from error
             content = {"what": what, "run": "", "process": os.getpid(), "keys": {e.key: e.role for e in wanted}}
             content["since"] = f"{datetime.now(UTC).astimezone():%Y-%m-%d %H:%M:%S}"
             held = Held(descriptor, content, note)
@@ -219,12 +221,17 @@ def _one_at_a_time(folder: Path) -> Iterator[None]:
     try:
         descriptor = _lock_file(folder)
     except OSError as error:
-        raise RunError(f"{path}: the instruments cannot be claimed: {error.strerror}") from error
+        raise RunError(
+            f"{path}: the instruments cannot be claimed: {error.strerror}", code="claim.not_written"
+        ) from error
     try:
         end = time.monotonic() + LOCK_TIMEOUT
         while not _try_lock(descriptor):
             if time.monotonic() > end:
-                raise RunError(f"{path}: another program has held this lock for {LOCK_TIMEOUT:g} s; find and end it")
+                raise RunError(
+                    f"{path}: another program has held this lock for {LOCK_TIMEOUT:g} s; find and end it",
+                    code="claim.lock.held",
+                )
             time.sleep(POLL_INTERVAL)
         yield
     finally:
@@ -259,7 +266,8 @@ def _refuse_conflict(folder: Path, wanted: tuple[Use, ...]) -> None:
             if each in exclusive:
                 raise RunError(
                     f"{exclusive[each].label} is in use by another program: {claim}. Wait for its end, or stop it "
-                    "there. Nothing was opened, and nothing was created."
+                    "there. Nothing was opened, and nothing was created.",
+                    code="claim.instrument.used",
                 )
 
 

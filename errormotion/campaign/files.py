@@ -127,6 +127,8 @@ class CampaignTable(BaseModel):
 class MistakesError(BenchError):
     """A file with mistakes, each of which starts with its key; ``more`` is the message of a second file."""
 
+    code = "toml.mistakes"
+
     def __init__(self, source: Path, mistakes: Sequence[str], more: str = "") -> None:
         super().__init__("\n".join(filter(None, [tomlfile.report(source, mistakes), more])))
         self.source, self.mistakes, self.more = source, tuple(mistakes), more
@@ -277,7 +279,7 @@ def campaign_of(text: str, path: Path) -> CampaignPlan:
             plan = load_bench(path.parent / bench)
         except BenchError as error:
             there = os.path.isfile(path.parent / bench)
-            bench_error = error if there else BenchError(f"{path}: bench: {error}")
+            bench_error = error if there else BenchError(f"{path}: bench: {error}", code=error.code)
     try:
         campaign = parse_campaign(text, path, plan)
     except MistakesError as error:
@@ -285,7 +287,9 @@ def campaign_of(text: str, path: Path) -> CampaignPlan:
             raise
         raise MistakesError(path, error.mistakes, str(bench_error)) from None
     except BenchError:
-        raise bench_error or BenchError(f"{path}: the bench file cannot be read") from None
+        raise bench_error or BenchError(
+            f"{path}: the bench file cannot be read", code="bench.file.unreadable"
+        ) from None
     if mistakes := list(_missing(campaign)):
         raise MistakesError(path, mistakes)
     return campaign
@@ -303,7 +307,10 @@ def _refuse_other(path: Path, data: Mapping[str, Any], expected: str) -> None:
     """Raise BenchError for a file of another kind; otherwise all its keys would be reported as unknown."""
     found = str(data.get("schema", "")).removeprefix("errormotion.").partition("/")[0]
     if found != expected and found in _KINDS:
-        raise BenchError(f"{path}: expected a {expected} file; found a file of kind '{found}'. {_KINDS[found]}")
+        raise BenchError(
+            f"{path}: expected a {expected} file; found a file of kind '{found}'. {_KINDS[found]}",
+            code="bench.file.kind",
+        )
 
 
 def _missing(campaign: CampaignPlan) -> Iterator[str]:
@@ -389,7 +396,7 @@ def parse_campaign(text: str, source: Path, bench: BenchPlan | None) -> Campaign
     if table is None or mistakes:
         raise MistakesError(source, mistakes)
     if bench is None:
-        raise BenchError("")
+        raise BenchError("", code="bench.file.unreadable")
     tests = []
     for test in table.test:
         method = plugins.get("methods", test.method)

@@ -58,6 +58,8 @@ def new_entries(bench: BenchPlan) -> dict[str, Any]:
 class FolderGoneError(RunError):
     """A folder was moved or deleted while data were written to it."""
 
+    code = "run.folder.gone"
+
 
 class Presence:
     """A folder that must not be moved, deleted or replaced while data are written to it.
@@ -136,14 +138,16 @@ class RunFolder:
         name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{test}-{run_id}"
         path = runs / name
         if path.exists():
-            raise RunError(f"{path}: already exists; a run is never overwritten")
+            raise RunError(f"{path}: already exists; a run is never overwritten", code="run.folder.exists")
         try:
             make_folder(runs)
             with whole_folder(path) as part:
                 folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
                 folder.save()
         except OSError as error:
-            raise RunError(f"{path}: the run folder cannot be created: {error.strerror}") from error
+            raise RunError(
+                f"{path}: the run folder cannot be created: {error.strerror}", code="run.folder.not_created"
+            ) from error
         folder.path = path
         return folder
 
@@ -180,7 +184,7 @@ class RunFolder:
             The file cannot be written.
         """
         if "updated" in self.data and not self.present:
-            raise RunError(f"{self.path} is gone: it was moved or deleted during the run")
+            raise RunError(f"{self.path} is gone: it was moved or deleted during the run", code="run.folder.gone")
         self.data |= changes | ({} if status is None else {"status": status}) | {"updated": now()}
         replace_text(self.path / "run.json", json.dumps(plain(self.data), indent=1, ensure_ascii=False) + "\n")
 
@@ -223,7 +227,10 @@ class RunFolder:
             return None
         if isinstance(name, str) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts:
             return self.inside(name)
-        raise RunError(f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}")
+        raise RunError(
+            f"{self.path / 'run.json'}: errors: expected a file in this folder; found {name!r:.100}",
+            code="run.errors.outside",
+        )
 
     def inside(self, name: str) -> Path:
         """Return a path in this folder.
@@ -235,7 +242,10 @@ class RunFolder:
         """
         path = self.path / name
         if leaves(self.path, path):
-            raise RunError(f"{path}: expected a file in this folder; it is, or lies behind, a link to another place")
+            raise RunError(
+                f"{path}: expected a file in this folder; it is, or lies behind, a link to another place",
+                code="run.file.link",
+            )
         return path
 
     @property
@@ -279,7 +289,8 @@ class RunFolder:
                 except BlockingIOError as error:
                     if time.monotonic() > end:
                         raise RunError(
-                            f"{self.path}: another process is using this run; wait until it ends, or stop it"
+                            f"{self.path}: another process is using this run; wait until it ends, or stop it",
+                            code="run.folder.used",
                         ) from error
                     time.sleep(CHECK_DURATION / 10)
             yield

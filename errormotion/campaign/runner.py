@@ -41,7 +41,7 @@ from errormotion.datasets.files.folders import looking_beside
 from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
 from errormotion.datasets.validation import explained
-from errormotion.errors import ErrormotionError, RunError
+from errormotion.errors import ErrormotionError, RunError, code_of
 from errormotion.report.page import logo
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -206,10 +206,13 @@ def resume(
     if changed and campaign:
         raise RunError(
             f"{campaign.source} or its bench file has changed since {runs / changed} was measured. Continue with the "
-            "stored files: 'errormotion run --resume' without the campaign. Or start a new run, without --resume."
+            "stored files: 'errormotion run --resume' without the campaign. Or start a new run, without --resume.",
+            code="campaign.changed",
         )
     message = f"Nothing to resume in {runs}: found {len(groups)} campaigns, none of them unfinished."
-    raise RunError("\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]))
+    raise RunError(
+        "\n  - ".join([message, *(f"skipped: {reason}" for reason in skipped)]), code="campaign.nothing_to_resume"
+    )
 
 
 def folders_of(folder: RunFolder, tests: Sequence[str]) -> dict[str, RunFolder]:
@@ -252,7 +255,7 @@ def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests:
             "The campaign cannot be continued, because it is unclear which tests were measured. Restore run.json from "
             f"a copy, or move the folder out of {runs} to measure its test again:"
         )
-        raise RunError("\n  - ".join([what, *unclear]))
+        raise RunError("\n  - ".join([what, *unclear]), code="campaign.tests.unclear")
     return found
 
 
@@ -351,7 +354,10 @@ class _Session:
         for key, name in test.inputs.items():
             source = folders[name]
             if source.errors is None:
-                raise RunError(f"{source.path}: expected the errors that the test '{test.name}' needs; found none")
+                raise RunError(
+                    f"{source.path}: expected the errors that the test '{test.name}' needs; found none",
+                    code="run.no_errors",
+                )
             inputs[key] = datasets.load(source.errors)
             folder.data["inputs"][key] = f"../{source.path.name}/{source.data['errors']}"
         folder.save(status="running", reason="")
@@ -415,7 +421,7 @@ class _Session:
                     shutil.rmtree(folder.raw)
                 folder.give_reserve()
         if recorder.committed == 0:
-            raise RunError(f"The method '{method.info.id}' yielded no data.")
+            raise RunError(f"The method '{method.info.id}' yielded no data.", code="method.no_data")
         folder.step("acquire", "done", samples=recorder.committed)
         folder.save(acquired=True)
 
@@ -537,7 +543,8 @@ def _failures(folder: RunFolder, test: TestPlan) -> Iterator[None]:
         raise RunError(
             f"Test '{folder.data['test']}' failed: {reason}\n"
             f"{_kept(folder)} in {folder.path}; the log is {folder.log}.\n"
-            f"Remove the cause first. {_continuation(folder, test)}"
+            f"Remove the cause first. {_continuation(folder, test)}",
+            code=code_of(error, "run.test.failed"),
         ) from error
 
 

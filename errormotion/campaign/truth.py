@@ -34,14 +34,19 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     """
     machine, clock = machine_of(folder), folder.data["clock"]
     if folder.errors is None:
-        raise RunError(f"{folder.path}: the run has no error dataset yet; identify its raw data first")
+        raise RunError(
+            f"{folder.path}: the run has no error dataset yet; identify its raw data first", code="run.no_errors"
+        )
     method = plugins.get("methods", str(folder.data["method"]["id"]))
     with datasets.load(folder.errors) as errors:
         start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
         stated = errors.attrs["component"] != "beam" and plugins.states(method, "truth")
         found: xr.Dataset | None = method().truth(machine, errors, between(clock["start"], start)) if stated else None
         if found is None:
-            raise RunError(f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}")
+            raise RunError(
+                f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}",
+                code="truth.not_stated",
+            )
         found = found.assign_attrs(
             {key: errors.attrs[key] for key in ("machine", "frame", "lever_axes") if key in errors.attrs}, start=start
         )
@@ -49,7 +54,9 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     try:
         datasets.validate(found)
     except DatasetError as error:
-        raise RunError(f"{folder.path}: the true errors are not a valid error dataset: {error}") from error
+        raise RunError(
+            f"{folder.path}: the true errors are not a valid error dataset: {error}", code="schema.violated"
+        ) from error
     return found
 
 
@@ -66,18 +73,21 @@ def machine_of(folder: RunFolder) -> VirtualMachine:
     clock, bench = folder.data.get("clock"), folder.data["bench"]
     if not isinstance(clock, dict):
         raise RunError(
-            f"{folder.path}: expected a run of a campaign on a virtual machine with a table [timeline]; found none"
+            f"{folder.path}: expected a run of a campaign on a virtual machine with a table [timeline]; found none",
+            code="truth.no_timeline",
         )
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     addresses = [parse_address(each.address) for each in plan.instruments if each.address]
     found = {(each.host, int(each.number("seed", 0))) for each in addresses if each.scheme == "sim"}
     if len(found) != 1:
         names = ", ".join(f"sim://{host} with seed {seed}" for host, seed in sorted(found)) or "none"
-        raise RunError(f"{folder.path}: expected one virtual machine on the bench; found {names}")
+        raise RunError(
+            f"{folder.path}: expected one virtual machine on the bench; found {names}", code="truth.machine.ambiguous"
+        )
     ((name, seed),) = found
     machine = VirtualMachine(plan.description if name == NAME and plan.description else name, seed=seed)
     try:
         machine.start([Event(**event) for event in clock["schedule"]])
     except BenchError as error:
-        raise RunError(f"{folder.path / 'run.json'}: clock.schedule: {error}") from error
+        raise RunError(f"{folder.path / 'run.json'}: clock.schedule: {error}", code="truth.schedule.form") from error
     return machine

@@ -14,8 +14,8 @@ import typer
 
 from errormotion.cli import options
 from errormotion.cli.demo import COMPENSATED, CONTROLLERS
-from errormotion.cli.guard import ERROR, USAGE
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.guard import ERROR, UsageError
+from errormotion.cli.output import failure, show, show_json, table
 from errormotion.cli.root import app, bench_app, compensate_app, model_app, plugins_app
 from errormotion.cli.wording import share
 
@@ -53,8 +53,7 @@ def demo(
     """Measure a virtual machine and compare the result with the truth."""
     shown = COMPENSATED if compensate else CONTROLLERS
     if controller not in shown:
-        show(f"--controller {controller}: expected one of {', '.join(shown)}.", err=True)
-        raise typer.Exit(USAGE)
+        raise UsageError(f"--controller {controller}: expected one of {', '.join(shown)}.", code="option.choice")
     import_module(shown[controller]).run(runs, json_)
 
 
@@ -99,7 +98,9 @@ def doctor(json_: options.Json = False) -> None:
 
     findings = command.examine()
     if json_:
-        show_json({"ok": all(f.ok for f in findings), "findings": [f.__dict__ for f in findings]})
+        bad = [f"{f.name}: {f.message}" for f in findings if not f.ok]
+        error = failure("\n".join(bad), code="doctor.findings") if bad else {}
+        show_json({"ok": not bad, "findings": [f.__dict__ for f in findings], **error})
     else:
         show(table(["", "what", "found"], [["ok" if f.ok else "BAD", f.name, f.message] for f in findings]))
     if not all(f.ok for f in findings):

@@ -17,7 +17,7 @@ from typing import Any, ParamSpec
 import typer
 
 from errormotion.cli import output
-from errormotion.errors import ErrormotionError
+from errormotion.errors import ErrormotionError, code_of
 from errormotion.state import close_to_others, open_itself, own_folder, state_folder
 
 OK, ERROR, USAGE, INVALID, INTERNAL, INTERRUPTED = 0, 1, 2, 3, 70, 130
@@ -25,6 +25,12 @@ NONCONFORMING, UNDECIDED = 4, 5
 """Exit codes of decisions on tolerances; see ``errormotion.cli.tolerances``."""
 
 P = ParamSpec("P")
+
+
+class UsageError(ErrormotionError):
+    """The options and arguments of a command do not fit together; exit code `USAGE`."""
+
+    code = "option.form"
 
 
 def guarded(function: Callable[P, None]) -> Callable[P, None]:
@@ -46,28 +52,29 @@ def _run(function: Callable[..., None], args: Any, kwargs: Any) -> None:
     except (typer.Exit, typer.Abort):
         raise
     except KeyboardInterrupt as error:
-        fail(f"Interrupted. {error}".strip(), error, INTERRUPTED, as_json)
+        fail(f"Interrupted. {error}".strip(), error, INTERRUPTED, as_json, code="command.interrupted")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has closed the pipe
         raise typer.Exit(ERROR) from None
     except ErrormotionError as error:
-        fail(str(error), error, ERROR, as_json)
+        fail(str(error), error, USAGE if isinstance(error, UsageError) else ERROR, as_json)
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
-        fail(f"{name}{error.strerror or error}", error, ERROR, as_json)
+        fail(f"{name}{error.strerror or error}", error, ERROR, as_json, code="system.refused")
     except Exception as error:  # noqa: BLE001 - the last handler
         text = f"Internal error: {type(error).__name__}: {error}\n"
         text += f"The traceback is in {log_file()}." if os.access(log_file().parent, os.W_OK) else format_exc()
-        fail(text, error, INTERNAL, as_json)
+        fail(text, error, INTERNAL, as_json, code="error.internal")
 
 
-def fail(message: str, error: BaseException, code: int, as_json: bool) -> None:
+def fail(message: str, error: BaseException, status: int, as_json: bool, *, code: str = "error.internal") -> None:
     """Print the message on stderr (and as JSON on stdout), log the traceback, and exit."""
     logging.getLogger("errormotion.cli").error("%s", message, exc_info=error)
     if as_json:
-        output.show_json({"ok": False, "error": {"type": type(error).__name__, "message": message, "exit_code": code}})
+        about = {"type": type(error).__name__, "exit_code": status}
+        output.show_json({"ok": False, **output.failure(message, code=code_of(error, code), **about)})
     output.show(message, err=True)
-    raise typer.Exit(code)
+    raise typer.Exit(status)
 
 
 def log_file() -> Path:

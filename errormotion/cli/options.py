@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from errormotion.cli.guard import USAGE
-from errormotion.cli.output import show
+from errormotion.cli.guard import UsageError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
 Runs = Annotated[Path | None, typer.Option("--runs", help="Folder for run folders; default: that of the campaign.")]
@@ -37,8 +36,7 @@ def point(option: str, text: str) -> Point:
     try:
         x, y, z = (float(part) / 1e3 for part in text.split(","))
     except ValueError:
-        show(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", err=True)
-        raise typer.Exit(USAGE) from None
+        raise UsageError(f"{option} {text}: expected three numbers in mm, as in 0,0,-150", code="option.form") from None
     return x, y, z
 
 
@@ -54,8 +52,9 @@ def date(option: str, text: str | None) -> datetime | None:
     try:
         return datetime.fromisoformat(text)
     except ValueError:
-        show(f"{option} {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", err=True)
-        raise typer.Exit(USAGE) from None
+        raise UsageError(
+            f"{option} {text}: expected a date, as in 2026-03-31 or 2026-03-31T08:00+01:00", code="option.form"
+        ) from None
 
 
 def parts(text: str | None) -> list[str]:
@@ -84,7 +83,7 @@ def quantity(option: str, text: str, kind: Any) -> float:
         value: float = TypeAdapter(kind).validate_python(text)
     except ValidationError as error:
         reason = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise DatasetError(f"{option} {text}: {reason}") from None
+        raise DatasetError(f"{option} {text}: {reason}", code="option.form") from None
     return value
 
 
@@ -102,10 +101,10 @@ def duration(option: str, text: str, longest: float = float("inf")) -> float:
     try:
         value = TIME.parse(text)
     except ValueError as error:
-        raise BenchError(f"{option}: {error}") from None
+        raise BenchError(f"{option}: {error}", code="option.form") from None
     if not 0 < value <= longest:
         bound = "" if longest == float("inf") else f" and at most {longest:g} s"
-        raise BenchError(f"{option}: expected more than 0 s{bound}; found '{text}'")
+        raise BenchError(f"{option}: expected more than 0 s{bound}; found '{text}'", code="option.outside")
     return value
 
 
@@ -134,15 +133,17 @@ def read_settings(model: Any, file: Path | None, assignments: Sequence[str]) -> 
     for assignment in assignments:
         key, sign, text = assignment.partition("=")
         if not sign or not key.strip():
-            raise MethodError(f"--set {assignment}: expected key=value, such as --set average='0.5 s'")
+            raise MethodError(
+                f"--set {assignment}: expected key=value, such as --set average='0.5 s'", code="option.form"
+            )
         *tables, name = key.strip().split(".")
         target = data
         for table in tables:
             target = target.setdefault(table, {})
             if not isinstance(target, dict):
-                raise MethodError(f"--set {assignment}: '{table}' is a value, not a table")
+                raise MethodError(f"--set {assignment}: '{table}' is a value, not a table", code="option.form")
         target[name] = value_of(text.strip())
     settings, mistakes = tomlfile.check(data, model)
     if settings is None:
-        raise MethodError(tomlfile.report(file or "--set", mistakes))
+        raise MethodError(tomlfile.report(file or "--set", mistakes), code="method.settings.mistakes")
     return settings

@@ -54,6 +54,11 @@ def show_json(value: Any) -> None:
     sys.stdout.write(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text) + "\n")
 
 
+def failure(message: str, *, code: str, **about: Any) -> dict[str, Any]:
+    """Return the member ``error`` of a JSON document, by whose code a program distinguishes failures."""
+    return {"error": {"code": code, "message": message, **about}}
+
+
 @contextmanager
 def working(what: str) -> Iterator[None]:
     """Print on a terminal what the command is doing, if the block takes longer than `NOTICE_DELAY`."""

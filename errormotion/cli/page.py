@@ -36,7 +36,9 @@ def page_of(file: Path | None, pdf: bool, paper: str | None, language: str | Non
     if file is None:
         given = [name for name, value in (("--pdf", pdf), ("--paper", paper), ("--language", language)) if value]
         if given:
-            raise DatasetError(f"{', '.join(given)}: allowed with a page only; add --report PAGE.html")
+            raise DatasetError(
+                f"{', '.join(given)}: allowed with a page only; add --report PAGE.html", code="option.page.missing"
+            )
         return None
     from errormotion.report.write import Form, page_file
 
@@ -54,7 +56,9 @@ def new_files(page: Page | None, *others: Path | None) -> list[Path]:
     files = [*(each for each in others if each is not None), *(page.files if page is not None else ())]
     for path in files:
         if path.exists():
-            raise DatasetError(f"{path}: already exists, and a result is never overwritten; give another name")
+            raise DatasetError(
+                f"{path}: already exists, and a result is never overwritten; give another name", code="file.exists"
+            )
     return files
 
 
@@ -67,5 +71,5 @@ def new_dataset(out: Path) -> None:
         The name does not end in .nc, or the file already exists.
     """
     if out.suffix != ".nc":
-        raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)")
+        raise DatasetError(f"{out}: expected a name that ends in .nc (NetCDF-4 file)", code="file.name.ending")
     new_files(None, out)

@@ -56,7 +56,10 @@ def load(paths: Sequence[Path], names: Mapping[str, Path], *, every: bool = Fals
     for name, path in names.items():
         files = _files(path, found.omitted)
         if len(files) != 1:
-            raise DatasetError(f"{path}: expected one error dataset for the name '{name}'; found {len(files)}")
+            raise DatasetError(
+                f"{path}: expected one error dataset for the name '{name}'; found {len(files)}",
+                code="compare.result.ambiguous",
+            )
         _add(found, name, files[0][1], path)
     return found
 
@@ -79,7 +82,7 @@ def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[st
     if path.is_file():
         return [(path.stem, path)]
     if not path.is_dir():
-        raise DatasetError(f"{path}: no such file or folder")
+        raise DatasetError(f"{path}: no such file or folder", code="file.not_found")
     if not is_runs_folder(path):
         folder = RunFolder.open(path)
         return [(str(folder.data["test"]), _errors(folder))]
@@ -96,11 +99,13 @@ def _files(path: Path, omitted: list[str], every: bool = False) -> list[tuple[st
         if test not in newest or created >= newest[test][0]:
             newest[test] = (created, errors)
     if not newest:
-        raise DatasetError(f"{path}: none of the runs has errors; identify them first")
+        raise DatasetError(f"{path}: none of the runs has errors; identify them first", code="run.no_errors")
     return everything if every else [(test, errors) for test, (_, errors) in newest.items()]
 
 
 def _errors(folder: RunFolder) -> Path:
     if folder.errors is None or not folder.errors.is_file():
-        raise RunError(f"{folder.path}: the run has no error dataset yet; identify its raw data first")
+        raise RunError(
+            f"{folder.path}: the run has no error dataset yet; identify its raw data first", code="run.no_errors"
+        )
     return folder.errors

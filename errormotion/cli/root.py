@@ -6,10 +6,33 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import typer
+from typer.core import TyperGroup
 
-from errormotion.cli.guard import guarded
+from errormotion.cli.guard import USAGE, guarded
+from errormotion.cli.output import failure, show_json
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+_UsageError: Any = typer.BadParameter.__mro__[1]
+"""The error of wrong options and arguments, which typer does not export."""
+
+
+class _Commands(TyperGroup):
+    """All commands; after ``--json``, unknown options and arguments too are reported as a JSON document."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta[__name__] = "--json" in args
+        return list(super().parse_args(ctx, args))
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except _UsageError as error:
+            if ctx.meta[__name__]:
+                about = {"type": type(error).__name__, "exit_code": USAGE}
+                show_json({"ok": False, **failure(error.format_message(), code="option.unknown", **about)})
+            raise
 
 
 class _Group(typer.Typer):
@@ -22,6 +45,7 @@ class _Group(typer.Typer):
 
 app = _Group(
     name="errormotion",
+    cls=_Commands,
     help="Measure the error motions of machine tools.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},

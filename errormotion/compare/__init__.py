@@ -94,7 +94,10 @@ def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground
 def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
     estimates = ground.estimates
     if against and against not in (names := [each.name for each in estimates]):
-        raise DatasetError(f"against: expected one of the datasets {', '.join(names)}; found '{against}'")
+        raise DatasetError(
+            f"against: expected one of the datasets {', '.join(names)}; found '{against}'",
+            code="compare.against.unknown",
+        )
     if not against and len(estimates) > MAX_FOR_ALL_PAIRS:
         against = estimates[0].name
         ground.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")

@@ -104,7 +104,9 @@ def common_ground(
     """
     names = list(datasets)
     if len(names) < 2:
-        raise DatasetError(f"Expected at least two datasets to compare; found {len(names)}")
+        raise DatasetError(
+            f"Expected at least two datasets to compare; found {len(names)}", code="compare.datasets.too_few"
+        )
     for name, ds in datasets.items():
         _check(name, ds)
     _once(datasets)
@@ -126,7 +128,8 @@ def common_ground(
     if frame in UNKNOWN:
         raise DatasetError(
             f"{', '.join(map(repr, names))}: their frame is unknown (attribute 'frame': '{frame}'), so that their axes "
-            "may have different directions. State the frame"
+            "may have different directions. State the frame",
+            code="compare.frame.unknown",
         )
     if machine in UNKNOWN:
         notes.append(f"No dataset states its machine ('{machine}'); they are treated as datasets of one machine.")
@@ -160,10 +163,13 @@ def common_ground(
     for name in freedoms:
         for dataset, each in zip(placed, seen, strict=True):
             if name not in each:
-                raise DatasetError(f"'{dataset}' does not state {name}; it states {', '.join(each) or 'nothing'}")
+                raise DatasetError(
+                    f"'{dataset}' does not state {name}; it states {', '.join(each) or 'nothing'}",
+                    code="compare.attribute.missing",
+                )
     if not chosen:
         states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(placed, seen, strict=True))
-        raise DatasetError(f"The datasets have no freedom in common: {states}")
+        raise DatasetError(f"The datasets have no freedom in common: {states}", code="compare.freedoms.none_common")
     _check_rotations(moved, chosen)
     return Ground(
         estimates=[each.estimate(name, chosen) for name, each in placed.items()],
@@ -224,15 +230,19 @@ def _check(name: str, ds: xr.Dataset) -> None:
         validate(ds)
         ds.em.names  # noqa: B018 - raises if it is not an error dataset
     except DatasetError as error:
-        raise DatasetError(f"'{name}': {error}") from None
+        raise DatasetError(f"'{name}': {error}", code=error.code) from None
     if ds.em.names != DOF:
-        raise DatasetError(f"'{name}': errors along one direction only (deviation) cannot be compared")
+        raise DatasetError(
+            f"'{name}': errors along one direction only (deviation) cannot be compared",
+            code="compare.freedoms.one_direction",
+        )
     variance = np.diagonal(ds["covariance"].values, axis1=-2, axis2=-1)
     known = np.isfinite(variance)
     if known.any() and not (variance[known] > 0).any():
         raise DatasetError(
             f"'{name}': its covariance is 0 everywhere; expected the uncertainty of its errors. State a small "
-            "uncertainty for exact values, such as true errors"
+            "uncertainty for exact values, such as true errors",
+            code="compare.covariance.zero",
         )
 
 
@@ -240,7 +250,8 @@ def _check_dimensions(name: str, ds: xr.Dataset) -> None:
     if len(ds["EX"].dims) > 1:
         raise DatasetError(
             f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one value of all but one, as "
-            "in ds.isel(position=3) or --over time --select position=3"
+            "in ds.isel(position=3) or --over time --select position=3",
+            code="compare.dims.too_many",
         )
 
 
@@ -251,7 +262,10 @@ def _once(datasets: Mapping[str, xr.Dataset]) -> None:
         alike = seen.setdefault(b"".join(ds[freedom].values.tobytes() for freedom in DOF), [])
         for other in alike:
             if datasets[name].identical(datasets[other]):
-                raise DatasetError(f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements")
+                raise DatasetError(
+                    f"'{other}' and '{name}' are the same dataset; a comparison needs two measurements",
+                    code="compare.dataset.same",
+                )
         alike.append(name)
 
 
@@ -266,7 +280,9 @@ def _same(datasets: Mapping[str, xr.Dataset], attribute: str, alike: Mapping[str
             "component": ". Compare those of one part of the machine; a comparison of the errors of an axis and of the "
             "tool needs the kinematic chain",
         }.get(attribute, "")
-        raise DatasetError(f"The datasets have different attributes '{attribute}' ({stated}){hint}")
+        raise DatasetError(
+            f"The datasets have different attributes '{attribute}' ({stated}){hint}", code="compare.attribute.differs"
+        )
     return values.pop()
 
 
@@ -275,7 +291,7 @@ def _at(name: str, ds: xr.Dataset, point: Array) -> xr.Dataset:
         moved: xr.Dataset = ds.em.at(point)
     except DatasetError as error:
         own = ",".join(f"{1e3 * each:g}" for each in ds.attrs["functional_point"])
-        raise DatasetError(f"'{name}': {error}, or compare at its own point (--at {own})") from None
+        raise DatasetError(f"'{name}': {error}, or compare at its own point (--at {own})", code=error.code) from None
     return moved
 
 
@@ -288,7 +304,8 @@ def _check_rotations(datasets: Mapping[str, xr.Dataset], freedoms: Sequence[str]
         raise DatasetError(
             f"The rotations ({', '.join(turns)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
             "means a rigid motion of the tool, fewer axes mean the frame of the axes that carry the tool. Compare the "
-            f"displacements: {_displacements(freedoms)}"
+            f"displacements: {_displacements(freedoms)}",
+            code="compare.bodies.differ",
         )
 
 
@@ -301,7 +318,9 @@ def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
     dims = {name: ds["EX"].dims for name, ds in datasets.items()}
     if len(set(dims.values())) > 1:
         stated = "; ".join(f"'{name}': {', '.join(map(str, each)) or 'none'}" for name, each in dims.items())
-        raise DatasetError(f"The errors of the datasets depend on different dimensions ({stated})")
+        raise DatasetError(
+            f"The errors of the datasets depend on different dimensions ({stated})", code="compare.dims.differ"
+        )
     found = next(iter(dims.values()))
     return str(found[0]) if found else ""
 
@@ -315,7 +334,8 @@ def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: li
         raise DatasetError(
             f"{', '.join(repr(name) for name in missing)}: no attribute 'start' (UTC of time 0), so that its times "
             "cannot be related to those of the others. State it, or state that all start at the same instant "
-            "(same_start, --same-start)"
+            "(same_start, --same-start)",
+            code="compare.start.missing",
         )
     if missing:
         notes.append(f"Time 0 of all datasets is treated as the same instant: {', '.join(missing)} without start.")
@@ -339,7 +359,10 @@ def _in_time(
             f"'{name}': {times[0]:g} s to {times[-1]:g} s" if times.size else f"'{name}': no known values"
             for name, times in known.items()
         )
-        raise DatasetError(f"The datasets do not overlap in time (s after the start of '{names[0]}'): {spans}")
+        raise DatasetError(
+            f"The datasets do not overlap in time (s after the start of '{names[0]}'): {spans}",
+            code="compare.times.no_overlap",
+        )
     inside = {name: times[(times >= first) & (times <= last)] for name, times in known.items()}
     sparse = min(inside, key=lambda name: inside[name].size)
     grid = inside[sparse]
@@ -347,7 +370,10 @@ def _in_time(
         grid = grid[grid > since]
         grid = np.concatenate([[since], grid])
         if not first <= since <= last:
-            raise DatasetError(f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s")
+            raise DatasetError(
+                f"since: expected a time from {first:g} s to {last:g} s; found {since:g} s",
+                code="compare.since.outside",
+            )
     others = [name for name in names if name != sparse]
     kept = _apart(grid, [shifted[name]["time"].values for name in others])
     if (~kept).any():
@@ -357,13 +383,17 @@ def _in_time(
         )
         grid = grid[kept]
     if grid.size < 2:
-        raise DatasetError("The datasets have fewer than two common times; a change needs a reference and a value")
+        raise DatasetError(
+            "The datasets have fewer than two common times; a change needs a reference and a value",
+            code="compare.times.too_few",
+        )
     notes.append(f"Grid: the {grid.size} times of '{sparse}'; interpolated: {', '.join(others)}.")
     placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
     for name, each in placed.items():
         if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
             raise DatasetError(
-                f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state"
+                f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state",
+                code="compare.reference.unknown",
             )
     return {name: each.since_first() for name, each in placed.items()}, grid
 
@@ -395,7 +425,8 @@ def _in_place(datasets: Mapping[str, xr.Dataset], dim: str, notes: list[str]) ->
                 rows[name].append(int(match or 0))
     if not rows[names[0]]:
         raise DatasetError(
-            f"The datasets {', '.join(map(repr, names))} have no {dim} in common (within {SAME_POINT * 1e6:g} um)"
+            f"The datasets {', '.join(map(repr, names))} have no {dim} in common (within {SAME_POINT * 1e6:g} um)",
+            code="compare.points.none_common",
         )
     left = {name: ds.sizes[dim] - len(rows[name]) for name, ds in datasets.items()}
     if any(left.values()):
@@ -413,7 +444,10 @@ def _points(name: str, ds: xr.Dataset, dim: str) -> list[Any]:
         return list(np.stack([ds[axis].values for axis in axes], axis=-1))
     if dim in ds.coords:
         return list(ds[dim].values.tolist())
-    raise DatasetError(f"'{name}': its {dim} has no coordinate; its values cannot be matched with those of the others")
+    raise DatasetError(
+        f"'{name}': its {dim} has no coordinate; its values cannot be matched with those of the others",
+        code="compare.coordinate.missing",
+    )
 
 
 def _match(point: Any, points: list[Any]) -> int | None:

@@ -71,12 +71,13 @@ def labels(datasets: Mapping[str, xr.Dataset], by: str) -> dict[str, str]:
         A dataset does not state this.
     """
     if by not in BY[1:]:
-        raise DatasetError(f"Expected groups by {', '.join(BY)}; found '{by}'")
+        raise DatasetError(f"Expected groups by {', '.join(BY)}; found '{by}'", code="repeats.group.unknown")
     found = {name: _label(ds, by) for name, ds in datasets.items()}
     if missing := [name for name, label in found.items() if not label]:
         raise DatasetError(
             f"{', '.join(map(repr, missing))}: no {by} is stated, so that it cannot be assigned to a group. "
-            + ("The provenance states no serial number" if by == "instrument" else f"Set the attribute '{by}'")
+            + ("The provenance states no serial number" if by == "instrument" else f"Set the attribute '{by}'"),
+            code="repeats.group.not_stated",
         )
     return found
 
@@ -108,7 +109,7 @@ def repeats(estimates: Sequence[Estimate], groups: Sequence[str]) -> Repeats:
         There are fewer than two datasets.
     """
     if len(estimates) < 2:
-        raise DatasetError(f"Repeats need at least two datasets; found {len(estimates)}")
+        raise DatasetError(f"Repeats need at least two datasets; found {len(estimates)}", code="repeats.too_few")
     names = list(dict.fromkeys(groups))
     number = np.array([names.index(group) for group in groups])
     within, between, h = _contrasts(number, len(names))

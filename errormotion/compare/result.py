@@ -143,7 +143,7 @@ def build(
         attrs |= {"since": ground.since, "start": ground.start}
     ds = xr.Dataset(variables, coords=coords, attrs=attrs)
     if wrong := violations(ds):
-        raise DatasetError(f"The result of the comparison does not conform to {SCHEMA}:", wrong)
+        raise DatasetError(f"The result of the comparison does not conform to {SCHEMA}:", wrong, code="schema.violated")
     return ds
 
 

@@ -72,11 +72,13 @@ class Campaigns:
             bench = "bench.toml" if self.bench is None else os.path.relpath(self.bench, self.folder)
             return NEW.format(bench=value(bench))
         if Path(name).name != name or "\0" in name or not _is_campaign(self.folder / name):
-            raise NotFoundError(f"No campaign file {name[:100]!r} in {self.folder}.")
+            raise NotFoundError(f"No campaign file {name[:100]!r} in {self.folder}.", code="campaign.file.not_found")
         try:
             return read_bytes(self.folder / name, MAX_TEXT).decode("utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            raise BenchError(f"{self.folder / name}: cannot be read: {error}") from error
+            raise BenchError(
+                f"{self.folder / name}: cannot be read: {error}", code="campaign.file.unreadable"
+            ) from error
 
     def with_test(self, name: str, text: str) -> Form:
         """Return the form of a text to which a test was added."""
@@ -122,7 +124,9 @@ class Campaigns:
             The name is invalid, the text has mistakes, or the file was changed since it was opened.
         """
         if not NAME.fullmatch(name):
-            raise BenchError(f"expected a file name such as drift.toml; found {name[:100]!r}")
+            raise BenchError(
+                f"expected a file name such as drift.toml; found {name[:100]!r}", code="campaign.file.name"
+            )
         self._valid(name, text)
         path = self._path(name)
         if path.exists() or path.is_symlink():
@@ -130,23 +134,28 @@ class Campaigns:
             if found == text:
                 return path
             if hash_of(found) != before:
-                raise BenchError(f"{name} was changed by another program since it was opened; choose another name")
+                raise BenchError(
+                    f"{name} was changed by another program since it was opened; choose another name",
+                    code="campaign.file.changed",
+                )
         try:
             replace_text(path, text)
         except OSError as error:
-            raise BenchError(f"{path}: cannot be written: {error.strerror}") from error
+            raise BenchError(f"{path}: cannot be written: {error.strerror}", code="campaign.file.unwritable") from error
         return path
 
     def _valid(self, name: str, text: str) -> CampaignPlan:
         form = self.form(name, text)
         if form.plan is None:
-            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.")
+            raise BenchError(f"The campaign has {form.count} mistakes; correct them first.", code="toml.mistakes")
         return form.plan
 
     @staticmethod
     def _short(text: str) -> str:
         if len(text) > MAX_TEXT:
-            raise BenchError(f"expected a campaign of at most {MAX_TEXT} characters; found {len(text)}")
+            raise BenchError(
+                f"expected a campaign of at most {MAX_TEXT} characters; found {len(text)}", code="campaign.too_long"
+            )
         return text
 
     def _path(self, name: str) -> Path:
@@ -166,7 +175,8 @@ class Campaigns:
             if PurePosixPath(each).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
                 raise BenchError(
                     f"{each[:100]!r}: this dashboard was started without --allow-control, and reads files of its "
-                    "folder only"
+                    "folder only",
+                    code="campaign.file.outside",
                 )
 
 

@@ -162,7 +162,7 @@ class Compensations:
         """
         fits = 0 < len(key.encode("utf-8", "surrogatepass")) <= MAX_NAME and key == Path(key).name
         if not fits or not (self.runs / key / AUDIT).is_file():
-            raise CompensationError(f"No compensation {key[:100]!r} in {self.runs}.")
+            raise CompensationError(f"No compensation {key[:100]!r} in {self.runs}.", code="compensation.not_found")
         return self.runs / key
 
     def listed(self) -> list[tuple[str, bool, Status | None, str]]:
@@ -212,13 +212,14 @@ class Compensations:
         benches = {each.name: each for each in self.benches()}
         models = {each.name: each for each in self.models()}
         if bench not in benches or model not in models:
-            raise CompensationError("Choose a bench and a model from the lists.")
+            raise CompensationError("Choose a bench and a model from the lists.", code="compensation.choice.missing")
         plan = benches[bench].plan
         if plan is None:
-            raise CompensationError(benches[bench].wrong)
+            raise CompensationError(benches[bench].wrong, code="compensation.bench.wrong")
         if arm is not None and arm != plan.machine:
             raise CompensationError(
-                f"'{arm[:100]}' is not the name of the machine of {bench}. Nothing was started, nothing was written."
+                f"'{arm[:100]}' is not the name of the machine of {bench}. Nothing was started, nothing was written.",
+                code="compensation.arm.other_machine",
             )
         command = ["compensate", "run", str(benches[bench].path), "--model", str(models[model].path)]
         command += ["--runs", str(self.runs), *([] if arm is None else ["--arm", arm])]

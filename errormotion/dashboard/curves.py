@@ -88,7 +88,9 @@ def curves_of(
     for dim, size in others.items():
         index = (select or {}).get(dim, 0)
         if not 0 <= index < size:
-            raise DatasetError(f"{dim}: expected an index from 0 to {size - 1}; found {index}")
+            raise DatasetError(
+                f"{dim}: expected an index from 0 to {size - 1}; found {index}", code="request.index.outside"
+            )
         moved = moved.isel({dim: index})
     expanded, names = moved.em.expanded(k=2), moved.em.iso_names()
     curves = []

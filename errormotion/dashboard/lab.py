@@ -120,7 +120,7 @@ class Lab:
             path = root.joinpath(*parts)
             if not any(part in ("", ".", "..") for part in parts) and _inside(path / FILE, root):
                 return path
-        raise NotFoundError(f"No run {key[:MAX_KEY]!r} in {self.runs}.")
+        raise NotFoundError(f"No run {key[:MAX_KEY]!r} in {self.runs}.", code="run.not_found")
 
     def entry(self, key: str) -> Entry:
         """Return the entry of a run.
@@ -144,7 +144,7 @@ class Lab:
         name = self._entry(folder).errors if word == "errors" else FILES.get(word, "")
         if name and _inside(folder / name, folder):
             return folder / name
-        raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.")
+        raise NotFoundError(f"Run {key!r} has no file '{word[:20]}'.", code="run.file.not_found")
 
     def run(self, key: str) -> tuple[Entry, tuple[str, ...]]:
         """Return the entry of a run, and the keywords of its files.
@@ -205,7 +205,9 @@ def _date(text: str) -> datetime | None:
     try:
         return datetime.fromisoformat(text)
     except ValueError:
-        raise RunError(f"since: expected a date, as in 2026-03-31; found {text[:40]!r}") from None
+        raise RunError(
+            f"since: expected a date, as in 2026-03-31; found {text[:40]!r}", code="request.date.form"
+        ) from None
 
 
 def _inside(path: Path, folder: Path) -> bool:

@@ -39,7 +39,7 @@ class Planner:
             The text has mistakes, too many plans wait, or the plan takes too long.
         """
         if self._waiting >= MOST + WAITING:
-            raise RunError(f"{self._waiting} plans are being made; try again later")
+            raise RunError(f"{self._waiting} plans are being made; try again later", code="plan.too_many")
         bench = None if campaigns.bench is None else str(campaigns.bench)
         request = {"folder": str(campaigns.folder), "control": campaigns.control, "bench": bench}
         self._waiting += 1
@@ -47,11 +47,13 @@ class Planner:
             async with self._turn:
                 found = await asyncio.wait_for(self._answer({**request, "name": name, "text": text}), TIMEOUT)
         except TimeoutError:
-            raise RunError(f"The plan takes more than {TIMEOUT:g} s; use 'errormotion plan'") from None
+            raise RunError(
+                f"The plan takes more than {TIMEOUT:g} s; use 'errormotion plan'", code="plan.timeout"
+            ) from None
         finally:
             self._waiting -= 1
         if "error" in found:
-            raise RunError(found["error"])
+            raise RunError(found["error"], code=found["code"])
         tests: list[dict[str, Any]] = found["tests"]
         return tests
 
@@ -79,7 +81,9 @@ class Planner:
             found: dict[str, Any] = json.loads(await process.stdout.readline())
         except (OSError, ValueError):
             await _kill(process)
-            raise RunError("The plan could not be made: its process ended without an answer") from None
+            raise RunError(
+                "The plan could not be made: its process ended without an answer", code="plan.failed"
+            ) from None
         except BaseException:  # the client has left, or it takes too long
             await _kill(process)
             raise
@@ -112,7 +116,7 @@ def main() -> None:
         try:
             found: dict[str, Any] = {"tests": campaigns.plan(request["name"], request["text"])}
         except ErrormotionError as error:
-            found = {"error": str(error)}
+            found = {"error": str(error), "code": error.code}
         output.write(json.dumps(found) + "\n")
         output.flush()
 

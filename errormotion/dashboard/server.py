@@ -193,7 +193,8 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
             sockets = listeners(options.port, options.host)
         except OSError as error:
             raise RunError(
-                f"{options.host}, port {options.port}: the server cannot listen: {error.strerror}"
+                f"{options.host}, port {options.port}: the server cannot listen: {error.strerror}",
+                code="server.not_listening",
             ) from error
         port = int(sockets[0].getsockname()[1])
         pages = (*((("/now", "Now"),) if watch is not None else ()), *PAGES)
@@ -241,12 +242,15 @@ def _encryption(options: Options) -> ssl.SSLContext | None:
     if options.cert is None and options.key is None:
         return None
     if options.cert is None or options.key is None:
-        raise RunError("--cert and --key: expected both, or neither")
+        raise RunError("--cert and --key: expected both, or neither", code="server.certificate.half")
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     try:
         context.load_cert_chain(options.cert, options.key, password=_no_password)
     except (OSError, ssl.SSLError, ValueError) as error:
-        raise RunError(f"{options.cert}, {options.key}: cannot be used as certificate and key: {error}") from error
+        raise RunError(
+            f"{options.cert}, {options.key}: cannot be used as certificate and key: {error}",
+            code="server.certificate.unusable",
+        ) from error
     return context
 
 

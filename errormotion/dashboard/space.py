@@ -55,19 +55,22 @@ def drawing(ds: xr.Dataset, point: Sequence[float] | None = None, select: Mappin
         The dataset is no volume, an index is beyond its dimension, or no target can be drawn.
     """
     if not has_volume(ds):
-        raise DatasetError("a drawing in space needs EX, EY and EZ at targets with x, y and z")
+        raise DatasetError("a drawing in space needs EX, EY and EZ at targets with x, y and z", code="space.no_targets")
     moved = ds if point is None else ds.em.at(point)
     for dim in moved.em.dims:
         index = 0 if dim == "target" else (select or {}).get(dim, 0)
         if not 0 <= index < moved.sizes[dim]:
-            raise DatasetError(f"{dim}: expected an index from 0 to {moved.sizes[dim] - 1}; found {index}")
+            raise DatasetError(
+                f"{dim}: expected an index from 0 to {moved.sizes[dim] - 1}; found {index}",
+                code="request.index.outside",
+            )
         moved = moved if dim == "target" else moved.isel({dim: index})
     places = np.stack([np.asarray(moved[axis].values, dtype=float) for axis in PLACES], axis=-1)
     vectors = np.stack([np.asarray(moved[name].values, dtype=float) for name in LINEAR], axis=-1)
     expanded = moved.em.expanded(k=2).sel(dof=list(LINEAR)).transpose("target", "dof").values
     known = np.flatnonzero(np.isfinite(places).all(axis=-1) & np.isfinite(vectors).all(axis=-1))
     if not known.size:
-        raise DatasetError("no target has a known position and known errors")
+        raise DatasetError("no target has a known position and known errors", code="space.no_errors")
     picked = known[np.unique(np.linspace(0, known.size - 1, min(known.size, MAX_TARGETS)).astype(int))]
     lengths = np.linalg.norm(vectors[picked], axis=-1)
     longest = float(lengths.max())

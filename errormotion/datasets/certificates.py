@@ -49,7 +49,8 @@ def certificates_of(attrs: Mapping[Any, Any]) -> dict[str, str]:
     if not isinstance(found, dict) or wrong(found):
         raise DatasetError(
             f"attribute '{ATTRIBUTE}': expected a JSON object with texts of up to {LONGEST} characters for "
-            f"{', '.join(ITEMS)}; found {str(stated)[:80]!r}"
+            f"{', '.join(ITEMS)}; found {str(stated)[:80]!r}",
+            code="certificate.form",
         )
     return found
 

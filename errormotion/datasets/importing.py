@@ -59,4 +59,6 @@ def _reader(map_file: Path) -> LogReader:
     found = (
         f"found '{schema}'; {nearest(schema, known)}" if schema else f"found none. Known: {', '.join(sorted(known))}"
     )
-    raise DatasetError(f"{map_file}: schema: expected a raw schema or the schema of a map; {found}")
+    raise DatasetError(
+        f"{map_file}: schema: expected a raw schema or the schema of a map; {found}", code="import.map.schema"
+    )

@@ -27,7 +27,9 @@ def later(start: str, seconds: float) -> str:
     except (TypeError, ValueError):
         instant = datetime.min
     if instant.tzinfo is None:
-        raise DatasetError(f"start: expected an instant such as 2026-03-01T08:00:00+00:00; found '{start}'")
+        raise DatasetError(
+            f"start: expected an instant such as 2026-03-01T08:00:00+00:00; found '{start}'", code="time.start.form"
+        )
     return (instant.astimezone(UTC) + timedelta(seconds=seconds)).isoformat()
 
 

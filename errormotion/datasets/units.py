@@ -181,7 +181,7 @@ def _unit(text: str) -> pint.Unit:
         return _registry().parse_units(expression)
     # errors of pint, and those of Python that pint raises for names such as 'nan'
     except (pint.PintError, ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise DatasetError(f"'{text}' is not a known unit") from error
+        raise DatasetError(f"'{text}' is not a known unit", code="unit.unknown") from error
 
 
 def _expression(text: str) -> str:
@@ -193,7 +193,7 @@ def _expression(text: str) -> str:
         The text is not a sequence of names with whole exponents, and signs between them.
     """
     if len(text) > LONGEST:
-        raise DatasetError(f"'{text[:LONGEST]}...' is not a known unit")
+        raise DatasetError(f"'{text[:LONGEST]}...' is not a known unit", code="unit.unknown")
     plain = text.strip().translate(_SUPERSCRIPTS)
     if plain == "1":
         return ""
@@ -208,7 +208,7 @@ def _expression(text: str) -> str:
         if between is None:
             break
         sign, position = (-1 if "/" in between[0] else 1), between.end()
-    raise DatasetError(f"'{text}' is not a known unit")
+    raise DatasetError(f"'{text}' is not a known unit", code="unit.unknown")
 
 
 @cache
@@ -221,21 +221,23 @@ def _linear(source: str, target: str) -> tuple[Fraction, Fraction]:
     if source in _EXACT and target in _EXACT:
         (kind, factor), (other, unit) = _EXACT[source], _EXACT[target]
         if kind != other:
-            raise DatasetError(f"'{source}' is not convertible to '{target}'")
+            raise DatasetError(f"'{source}' is not convertible to '{target}'", code="unit.not_convertible")
         return factor / unit, Fraction(0)
     registry = _registry()
     from_, to = _unit(source), _unit(target)
     # Compared in base units, not in dimensions, since a per cent is not an angle.
     if registry.get_base_units(from_)[1] != registry.get_base_units(to)[1]:
-        raise DatasetError(f"'{source}' is not convertible to '{target}'")
+        raise DatasetError(f"'{source}' is not convertible to '{target}'", code="unit.not_convertible")
     try:
         zero, one, two = (Fraction(registry.Quantity(Fraction(n), from_).to(to).magnitude) for n in (0, 1, 2))
         factor = one - zero
         float(factor), float(1 / factor), float(zero)
     except (ArithmeticError, TypeError, ValueError) as error:  # logarithmic units, overflow
-        raise DatasetError(f"'{source}' is not convertible to '{target}'") from error
+        raise DatasetError(f"'{source}' is not convertible to '{target}'", code="unit.not_convertible") from error
     if two - one != factor:
-        raise DatasetError(f"'{source}' is not convertible to '{target}' by a factor and an offset")
+        raise DatasetError(
+            f"'{source}' is not convertible to '{target}' by a factor and an offset", code="unit.not_convertible"
+        )
     return factor, zero
 
 
@@ -279,7 +281,7 @@ def si_unit(unit: str) -> str:
             continue
         return kind.unit
     _unit(unit)
-    raise DatasetError(f"'{unit}' measures none of {', '.join(kind.kind for kind in KINDS)}")
+    raise DatasetError(f"'{unit}' measures none of {', '.join(kind.kind for kind in KINDS)}", code="unit.kind.unknown")
 
 
 def format_quantity(value: float, unit: str, digits: int = 4) -> str:

@@ -58,7 +58,9 @@ def explained(path: str | Path, ds: xr.Dataset) -> Iterator[None]:
         found = violations(ds)
         if not found:
             raise
-        raise DatasetError(f"{path}: breaks its schema ({ds.attrs.get('schema', 'none given')}):", found) from error
+        raise DatasetError(
+            f"{path}: breaks its schema ({ds.attrs.get('schema', 'none given')}):", found, code="schema.violated"
+        ) from error
 
 
 def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
@@ -71,7 +73,9 @@ def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
     """
     found = violations(ds, tables)
     if found:
-        raise DatasetError(f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", found)
+        raise DatasetError(
+            f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", found, code="schema.violated"
+        )
 
 
 def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
@@ -89,5 +93,5 @@ def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
     now = plugins.present_schema(str(found), method)
     validate(raw.assign_attrs(schema=now), tuple(method.raw_schemas))
     if now != schema:
-        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {found}.")
+        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {found}.", code="schema.other")
     return raw.assign_attrs(schema=found)

@@ -50,7 +50,7 @@ def with_linear(
     base = type(problem.unknowns)
     fields = problem.unknowns._fields
     if name in fields:
-        raise FitError(f"expected a new name; the unknowns '{name}' exist")
+        raise FitError(f"expected a new name; the unknowns '{name}' exist", code="estimation.unknown.name_used")
     J = design[:, None, :] if design.ndim == 2 else design
     rows = np.zeros(len(J), dtype=np.intp) if index is None else index
     size = int(rows.max(initial=0)) + 1

@@ -109,9 +109,15 @@ class Block(Table):
     def __post_init__(self) -> None:
         _check(self, self.start)
         if len(self.component) not in (0, self.start.shape[1]):
-            raise FitError(f"'{self.group}': expected {self.start.shape[1]} components; found {len(self.component)}")
+            raise FitError(
+                f"'{self.group}': expected {self.start.shape[1]} components; found {len(self.component)}",
+                code="estimation.block.components",
+            )
         if self.prior is not None and not (np.asarray(self.prior) > 0).all():
-            raise FitError(f"'{self.group}': expected standard deviations above 0 of the prior; found {self.prior}")
+            raise FitError(
+                f"'{self.group}': expected standard deviations above 0 of the prior; found {self.prior}",
+                code="estimation.prior.not_positive",
+            )
 
     @cached_property
     def freed(self) -> NDArray[np.bool_]:
@@ -160,11 +166,15 @@ class Constant(Table):
         if self.factor.shape[:2] != self.value.shape:
             raise FitError(
                 f"constant '{self.group}': expected a factor of shape {(*self.value.shape, 'k')}; "
-                f"found {self.factor.shape}"
+                f"found {self.factor.shape}",
+                code="estimation.constant.factor",
             )
         for what in ("names", "identity"):
             if len(given := getattr(self, what)) not in (0, self.sources):
-                raise FitError(f"constant '{self.group}': expected {self.sources} {what}; found {len(given)}")
+                raise FitError(
+                    f"constant '{self.group}': expected {self.sources} {what}; found {len(given)}",
+                    code="estimation.constant.sources",
+                )
 
     @property
     def sources(self) -> int:
@@ -192,7 +202,7 @@ class Noise:
 
     def __post_init__(self) -> None:
         if (self.sd is None) == (self.root is None):
-            raise FitError("expected either sd or root of the noise")
+            raise FitError("expected either sd or root of the noise", code="estimation.noise.both")
 
     def effect(self, L: Array) -> Array:
         """Return the effect of independent noise of unit size on residuals with derivatives L (n, m, r), (n, m, k)."""
@@ -214,12 +224,18 @@ def _check(table: Table, values: Array) -> None:
     """Raise an error if index, weight and table do not fit together."""
     name = f"'{table.group}': " if table.group else ""
     if values.ndim != 2:
-        raise FitError(f"{name}expected a table (size, width); found {values.shape}")
+        raise FitError(f"{name}expected a table (size, width); found {values.shape}", code="estimation.table.shape")
     if table.index.ndim not in (1, 2):
-        raise FitError(f"{name}expected an index (n,) or (n, w); found {table.index.shape}")
+        raise FitError(
+            f"{name}expected an index (n,) or (n, w); found {table.index.shape}", code="estimation.index.shape"
+        )
     if table.weight is not None and table.weight.shape != table.index.shape:
-        raise FitError(f"{name}expected weights of shape {table.index.shape}; found {table.weight.shape}")
+        raise FitError(
+            f"{name}expected weights of shape {table.index.shape}; found {table.weight.shape}",
+            code="estimation.weights.shape",
+        )
     if table.index.size and (table.index.min() < 0 or table.index.max() >= len(values)):
         raise FitError(
-            f"{name}expected rows of a table of {len(values)}; found {table.index.min()} to {table.index.max()}"
+            f"{name}expected rows of a table of {len(values)}; found {table.index.min()} to {table.index.max()}",
+            code="estimation.index.outside",
         )

@@ -168,9 +168,12 @@ def components(
         found = fit(_weighted(problem, contrasts.names, used), refresh=refresh, what=what, start=start)
         linear = _unweighted(found.linear, problem, contrasts.names, used)
     else:
-        raise FitError(f"the variances of {', '.join(names) or NOISE} have not converged in {MAX_FITS} fits to {what}")
+        raise FitError(
+            f"the variances of {', '.join(names) or NOISE} have not converged in {MAX_FITS} fits to {what}",
+            code="estimation.variances.not_converged",
+        )
     if found is None:
-        raise FitError("no fit")
+        raise FitError("no fit", code="estimation.no_fit")
     unit = np.where(used > 0, used, 1.0)
     inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)
     covariance = np.asarray(inverse * unit * unit[:, None], dtype=float)
@@ -244,7 +247,8 @@ class _Contrasts:
             normal = factorised(band, G[..., fixed], D[np.ix_(fixed, fixed)], gauge)
         except SingularError as error:
             raise FitError(
-                f"{what} do not determine all unknowns that are not random effects; measure more, or state a prior"
+                f"{what} do not determine all unknowns that are not random effects; measure more, or state a prior",
+                code="estimation.fixed.undetermined",
             ) from error
         right = np.concatenate([G[..., random], a[..., None]], axis=2)
         below = np.concatenate([D[np.ix_(fixed, random)], g[fixed][:, None]], axis=1)
@@ -273,7 +277,10 @@ class _Contrasts:
         Projected Fisher scoring, halving steps that do not increase the likelihood.
         """
         if self.freedom < 1:
-            raise FitError("no redundancy: the variances of noise and random effects cannot be estimated")
+            raise FitError(
+                "no redundancy: the variances of noise and random effects cannot be estimated",
+                code="estimation.no_redundancy",
+            )
         unit = self._reference()
         t = np.ones(len(unit)) if start is None else np.maximum(start / unit, FLOOR)
         noise = len(unit) - 1 if self.names and self.names[-1] == NOISE else -1

@@ -90,7 +90,10 @@ def relative(errors: Errors, datum: Datum) -> Relative:
     every = A if datum.beside is None else np.concatenate([A, datum.beside], axis=2)
     N = np.einsum("pdg,pd,pdh->gh", every, w, every)
     if np.linalg.matrix_rank(N, hermitian=True) < len(N):
-        raise FitError("the known values do not determine the datum; measure more of the places that define it")
+        raise FitError(
+            "the known values do not determine the datum; measure more of the places that define it",
+            code="estimation.datum.undetermined",
+        )
     H = np.einsum("gh,pdh,pd->pgd", np.linalg.inv(N)[: A.shape[2]], every, w)  # (place, g, d)
     value = np.where(known, errors.value, 0.0)
     h = np.einsum("pgd,pd->g", H, value)

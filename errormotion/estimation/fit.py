@@ -184,7 +184,8 @@ def fit(
     else:
         raise FitError(
             f"the fit to {what} has not converged after {MAX_ITERATIONS} iterations (the next step would still "
-            f"decrease the sum of squares by {decrement:.2g}). Check units and the order of the readings"
+            f"decrease the sum of squares by {decrement:.2g}). Check units and the order of the readings",
+            code="estimation.not_converged",
         )
     # The derivatives before the last step are those at the solution: it was far below the noise.
     if refresh is not None:
@@ -253,4 +254,7 @@ def _undetermined(linear: Linear, error: SingularError, what: str) -> FitError:
             rows = np.flatnonzero(np.isin(border, error.columns).any(axis=1))
             some = ", ".join(str(row + 1) for row in rows[:5]) + (", ..." if rows.size > 5 else "")
             names.append(f"{name} {some}")
-    return FitError(f"{what} do not determine {' and '.join(names) or 'all unknowns'}. Measure more, or elsewhere")
+    return FitError(
+        f"{what} do not determine {' and '.join(names) or 'all unknowns'}. Measure more, or elsewhere",
+        code="estimation.undetermined",
+    )

@@ -461,7 +461,7 @@ class Linear:
 def problem_block(linear: Linear) -> Block:
     """Return the eliminated block."""
     if linear.numbering.local is None:
-        raise FitError("no block is eliminated")
+        raise FitError("no block is eliminated", code="estimation.no_block")
     block: Block = linear.problem.unknowns[linear.numbering.local]
     return block
 

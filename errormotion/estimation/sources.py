@@ -161,7 +161,8 @@ def errors_of(
         names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
         without = ", ".join(names[k] for k in range(len(names)) if k not in tables)
         raise FitError(
-            f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})"
+            f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})",
+            code="estimation.places.no_errors",
         )
     if not sources:
         return Errors(value, np.zeros((*value.shape, value.shape[1])), [])
@@ -220,7 +221,9 @@ def _by_place(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array]) -> 
         each = J[k]
         if k == number.local:
             if each.shape[2] > 1:
-                raise FitError("places: expected one row of the eliminated unknowns for each place")
+                raise FitError(
+                    "places: expected one row of the eliminated unknowns for each place", code="estimation.places.rows"
+                )
             index = tables[k].index2[:, 0]
             local = each[:, :, 0] * block.freed[index][:, None, :]
             own = local @ normal.own[index] @ np.swapaxes(local, 1, 2)

@@ -124,7 +124,8 @@ def variance_factor(
     if priors and estimate is None and (increase or not stated):
         raise FitError(
             f"the noise of {what} must be an unknown of the fit (components): with priors or adjusted constants a "
-            "variance factor would scale their uncertainties as well"
+            "variance factor would scale their uncertainties as well",
+            code="estimation.noise.not_unknown",
         )
     name = what[:1].upper() + what[1:]
     many = f"{freedom} degree{'' if freedom == 1 else 's'} of freedom"
@@ -200,7 +201,8 @@ def _estimated(
     """Return the factor of an unknown noise."""
     if freedom < 1:
         raise FitError(
-            f"the noise of {what} is not stated, and there is no redundancy to estimate it. State it, or measure more"
+            f"the noise of {what} is not stated, and there is no redundancy to estimate it. State it, or measure more",
+            code="estimation.noise.unknown",
         )
     factor, found = (chi2 / freedom, float(freedom)) if estimate is None else estimate()
     ratio = float(np.sqrt(factor))

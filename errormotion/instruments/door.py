@@ -56,10 +56,14 @@ class Door:
         if not arm:
             raise InstrumentError(
                 f"{self._where} only reads, and this command changes the machine: {what}. Nothing was sent. To permit "
-                "it, set arm = true for the instrument in the bench file (arm=True in its settings)"
+                "it, set arm = true for the instrument in the bench file (arm=True in its settings)",
+                code="instrument.not_armed",
             )
         if self.limits.forbidden:
-            raise InstrumentError(f"{self._where}: {what}: refused, since {self.limits.forbidden}. Nothing was sent")
+            raise InstrumentError(
+                f"{self._where}: {what}: refused, since {self.limits.forbidden}. Nothing was sent",
+                code="motion.forbidden",
+            )
         if not self._announced:
             self._announced = True
             log.info("%s is armed (%s); its first command: %s", self._where, self.limits, what)
@@ -71,7 +75,10 @@ class Door:
         except (TypeError, ValueError, OverflowError):
             found = []
         if len(found) != 3 or not all(map(math.isfinite, found)):
-            raise InstrumentError(f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {point!r}")
+            raise InstrumentError(
+                f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {point!r}",
+                code="position.form",
+            )
         for axis, x in zip("XYZ", found, strict=True):
             self.coordinate(axis, x)
         return found
@@ -80,14 +87,16 @@ class Door:
         """Raise InstrumentError unless a displacement, (3,) m, is finite and fits between the limits of each axis."""
         if len(displacement) != 3 or not all(map(math.isfinite, displacement)):
             raise InstrumentError(
-                f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {displacement!r}"
+                f"{self._where}: expected {what} of three finite numbers X, Y, Z; found {displacement!r}",
+                code="position.form",
             )
         for axis, x in zip("XYZ", displacement, strict=True):
             span = self.limits.spans.get(axis)
             if span is not None and abs(x) > span[1] - span[0] + _ROUNDING:
                 raise InstrumentError(
                     f"{self._where}: {axis} would move by {1e3 * abs(x):.6g} mm; the limits of the bench are "
-                    f"{1e3 * (span[1] - span[0]):.6g} mm apart. Nothing was sent"
+                    f"{1e3 * (span[1] - span[0]):.6g} mm apart. Nothing was sent",
+                    code="motion.limit.position",
                 )
 
     def coordinate(self, axis: str, x: float) -> None:
@@ -97,7 +106,8 @@ class Door:
             low, high = (1e3 * each for each in span or (-math.inf, math.inf))
             raise InstrumentError(
                 f"{self._where}: {axis} would move to {1e3 * x:.6g} mm; the limits of the bench are {low:.6g} and "
-                f"{high:.6g} mm. Nothing was sent"
+                f"{high:.6g} mm. Nothing was sent",
+                code="motion.limit.position",
             )
 
     def feed(self, feed: float) -> float:
@@ -122,11 +132,13 @@ class Door:
         if not math.isfinite(found * scale) or (positive and found <= 0):
             above = " above 0" if positive else ""
             raise InstrumentError(
-                f"{self._where}: expected a finite {what}{above}; found {str(value)[:60]}. Nothing was sent"
+                f"{self._where}: expected a finite {what}{above}; found {str(value)[:60]}. Nothing was sent",
+                code="motion.value.form",
             )
         if limit is not None and abs(found) > limit * (1 + _ROUNDING):
             raise InstrumentError(
                 f"{self._where}: the {what} would be {found * scale:.6g} {unit}; the limit of the bench is "
-                f"{limit * scale:.6g} {unit}. Nothing was sent"
+                f"{limit * scale:.6g} {unit}. Nothing was sent",
+                code="motion.limit.value",
             )
         return found

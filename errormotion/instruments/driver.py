@@ -78,7 +78,8 @@ class Driver(Openable):
         """The open transport; InstrumentError before ``open``."""
         if self._transport is None:
             raise InstrumentError(
-                f"The {self.info.id} at {self.address} is not open: use it in a 'with' block, or call open() first"
+                f"The {self.info.id} at {self.address} is not open: use it in a 'with' block, or call open() first",
+                code="instrument.not_open",
             )
         return self._transport
 
@@ -170,7 +171,9 @@ class Driver(Openable):
             if found is not None:
                 return found
             others += 1
-        raise ProtocolError(f"{self.address}: expected an answer to {what}; found {others} other lines")
+        raise ProtocolError(
+            f"{self.address}: expected an answer to {what}; found {others} other lines", code="protocol.reply.other"
+        )
 
     def resynchronise(self) -> None:
         """Ensure, after a failed exchange, that no answer to an earlier request is read as the next one.

@@ -31,7 +31,10 @@ def check_program(text: str, door: Door) -> None:
         checked.
     """
     if len(text) > MAX_CHARACTERS:
-        raise InstrumentError(f"expected a program of at most {MAX_CHARACTERS} characters; found {len(text)}")
+        raise InstrumentError(
+            f"expected a program of at most {MAX_CHARACTERS} characters; found {len(text)}",
+            code="motion.program.too_long",
+        )
     limits = door.limits
     if not limits.spans and limits.feed is None and limits.spindle_speed is None:
         return
@@ -42,7 +45,9 @@ def check_program(text: str, door: Door) -> None:
         try:
             _check_line(_words(number, line), door, stated)
         except InstrumentError as error:
-            raise InstrumentError(f"line {number} '{line.strip()[:60]}' of the program: {error}") from None
+            raise InstrumentError(
+                f"line {number} '{line.strip()[:60]}' of the program: {error}", code=error.code
+            ) from None
 
 
 def _words(number: int, line: str) -> list[tuple[str, str]]:
@@ -68,23 +73,42 @@ def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> N
             raise _unknown(f"{letter}{value}")
     if dwell:  # a control may also move if a dwell has other words beside it
         if sorted(letter for letter, _ in words if letter != "N") not in (["G", "P"], ["G", "X"]):
-            raise InstrumentError("a dwell with other words on its line; write G4 P alone on a line")
+            raise InstrumentError(
+                "a dwell with other words on its line; write G4 P alone on a line", code="motion.program.dwell"
+            )
         return
     if door.limits.feed is not None and "G0" in codes:
-        raise InstrumentError("a rapid move at the feed of the machine; write G1 with a feed within the limit")
+        raise InstrumentError(
+            "a rapid move at the feed of the machine; write G1 with a feed within the limit",
+            code="motion.program.rapid",
+        )
     if door.limits.feed is not None and any(letter == "F" for letter, _ in words) and not {"G21", "G94"} <= stated:
-        raise InstrumentError("a feed F before a line with G21 and G94; whether it is within the limit is unknown")
+        raise InstrumentError(
+            "a feed F before a line with G21 and G94; whether it is within the limit is unknown",
+            code="motion.program.feed_unknown",
+        )
     stated |= {letter for letter, _ in words if letter in "FS"} | {code for code in codes if code[0] == "G"}
     if door.limits.spindle_speed is not None and {"M3", "M4"} & codes and "S" not in stated:
-        raise InstrumentError("the spindle is started before a speed S; whether it is within the limit is unknown")
+        raise InstrumentError(
+            "the spindle is started before a speed S; whether it is within the limit is unknown",
+            code="motion.program.speed_unknown",
+        )
     for letter, value in words:
         if letter in "XYZ":
             if not {"G21", "G90"} <= stated:
-                raise InstrumentError("a position before G21 and G90; whether it is within the limits is unknown")
+                raise InstrumentError(
+                    "a position before G21 and G90; whether it is within the limits is unknown",
+                    code="motion.program.position_unknown",
+                )
             if not _STRAIGHT & codes and not {"G0", "G1"} & stated:
-                raise InstrumentError("a position before G0 or G1; the path of the machine is unknown")
+                raise InstrumentError(
+                    "a position before G0 or G1; the path of the machine is unknown", code="motion.program.move_unknown"
+                )
             if door.limits.feed is not None and "F" not in stated:
-                raise InstrumentError("a move before a feed F; whether it is within the limit is unknown")
+                raise InstrumentError(
+                    "a move before a feed F; whether it is within the limit is unknown",
+                    code="motion.program.feed_unknown",
+                )
             door.coordinate(letter, float(value) * _MM)
         elif letter == "F":
             door.feed(float(value) * _MM_MIN)
@@ -93,4 +117,6 @@ def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> N
 
 
 def _unknown(what: str) -> InstrumentError:
-    return InstrumentError(f"'{what}': whether it stays within the limits of the bench is unknown")
+    return InstrumentError(
+        f"'{what}': whether it stays within the limits of the bench is unknown", code="motion.program.word_unknown"
+    )

@@ -48,8 +48,8 @@ class BlockError(ProgramError):
     why : str
     """
 
-    def __init__(self, line: int, text: str, why: str) -> None:
-        super().__init__(f"line {line} '{text.strip()[:60]}': {why}")
+    def __init__(self, line: int, text: str, why: str, *, code: str) -> None:
+        super().__init__(f"line {line} '{text.strip()[:60]}': {why}", code=code)
         self.line, self.why = line, why
 
 
@@ -122,8 +122,18 @@ def split(line: int, text: str) -> Block:
 def _unknown(line: int, text: str, pieces: list[str]) -> BlockError:
     """Return the error of a line with other pieces of text than words and comments."""
     if any(_OTHER.search(piece) for piece in pieces) or text.lstrip().lower().startswith("o"):
-        return refusal(line, text, "an expression, a variable or a control word (O), not supported by the plain reader")
-    return refusal(line, text, f"expected words (letter and number) and comments; found '{pieces[0][:20]}'")
+        return refusal(
+            line,
+            text,
+            "an expression, a variable or a control word (O), not supported by the plain reader",
+            code="program.line.not_plain",
+        )
+    return refusal(
+        line,
+        text,
+        f"expected words (letter and number) and comments; found '{pieces[0][:20]}'",
+        code="program.line.form",
+    )
 
 
 def code_of(text: str) -> str:
@@ -155,9 +165,9 @@ def is_title(text: str) -> bool:
     return _TITLE.fullmatch(text) is not None
 
 
-def refusal(line: int, text: str, why: str) -> BlockError:
+def refusal(line: int, text: str, why: str, *, code: str) -> BlockError:
     """Return the error of a line."""
-    return BlockError(line, text, why)
+    return BlockError(line, text, why, code=code)
 
 
 def lines_of(source: Iterable[str]) -> Iterator[tuple[int, str]]:
@@ -170,11 +180,16 @@ def lines_of(source: Iterable[str]) -> Iterator[tuple[int, str]]:
     """
     for count, line in enumerate(source, 1):
         if count > MAX_LINES:
-            raise ProgramError(f"expected a program of at most {MAX_LINES} lines")
+            raise ProgramError(f"expected a program of at most {MAX_LINES} lines", code="program.too_long")
         number = line.number if isinstance(line, SourceLine) else count
         text = line.rstrip("\r\n")
         if len(text) > MAX_LINE:
-            raise ProgramError(f"line {number}: expected at most {MAX_LINE} characters; found {len(text)}")
+            raise ProgramError(
+                f"line {number}: expected at most {MAX_LINE} characters; found {len(text)}",
+                code="program.line.too_long",
+            )
         if not text.isprintable() and _CONTROL.search(text):
-            raise ProgramError(f"line {number}: expected text; found control characters")
+            raise ProgramError(
+                f"line {number}: expected text; found control characters", code="program.line.control_characters"
+            )
         yield number, text

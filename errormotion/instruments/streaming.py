@@ -148,7 +148,8 @@ class Reader:
             left = max(self._last_data, start) + timeout - time.monotonic()
             if left <= 0:
                 raise InstrumentTimeoutError(
-                    f"{self._name}: no data for {timeout:g} s; is it switched on and connected?"
+                    f"{self._name}: no data for {timeout:g} s; is it switched on and connected?",
+                    code="instrument.no_answer",
                 )
             self._change.wait(left)
 
@@ -184,7 +185,9 @@ class Reader:
             if self._error is not None:
                 raise self._error
             partial = f"; received {self._text[:64]!r}, which is not complete" if self._text.strip() else ""
-            raise InstrumentTimeoutError(f"{self._name}: no answer to {request!r} within {timeout:g} s{partial}")
+            raise InstrumentTimeoutError(
+                f"{self._name}: no answer to {request!r} within {timeout:g} s{partial}", code="instrument.no_answer"
+            )
 
     def stop(self, request: bytes, timeout: float) -> bytes:
         """Write the request that ends the stream, wait for its answer, end the thread; return the answer."""
@@ -213,7 +216,9 @@ class Reader:
                     if now - max(self._last_data, start) >= quiet:
                         break
                     if now - start >= timeout:
-                        raise InstrumentTimeoutError(f"{self._name}: still sending {timeout:g} s after it was stopped")
+                        raise InstrumentTimeoutError(
+                            f"{self._name}: still sending {timeout:g} s after it was stopped", code="stream.not_stopped"
+                        )
                     self._change.wait(POLL_INTERVAL)
         finally:
             self.abandon()
@@ -239,9 +244,14 @@ class Reader:
                 if chunk.end is not None:
                     raise chunk.end
         except InstrumentError as error:
-            self._fail(type(error)(f"{self._name}: {error}"))
+            self._fail(error.restated(f"{self._name}: {error}"))
         except Exception as error:  # noqa: BLE001 - the caller must receive every error
-            self._fail(InstrumentError(f"{self._name}: the reader thread failed: {type(error).__name__}: {error}"))
+            self._fail(
+                InstrumentError(
+                    f"{self._name}: the reader thread failed: {type(error).__name__}: {error}",
+                    code="stream.reader.failed",
+                )
+            )
 
     def _fail(self, error: InstrumentError) -> None:
         with self._change:

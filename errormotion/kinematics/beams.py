@@ -111,7 +111,10 @@ def beam_errors(
     p0, u0, p, u = (np.asarray(part, float) for part in (nominal_origin, nominal_direction, origin, direction))
     cosine = np.sum(u0 * u, axis=-1)
     if (cosine <= 0).any():
-        raise MethodError("A detected beam points away from its nominal direction: check the nominal directions.")
+        raise MethodError(
+            "A detected beam points away from its nominal direction: check the nominal directions.",
+            code="beam.direction.opposite",
+        )
     errors = np.concatenate([p - p0, rotation_between(u0, u)], axis=-1)
     chart = error_jacobian(u0, u)
     moved = chart @ np.nan_to_num(np.asarray(covariance, float)) @ np.swapaxes(chart, -1, -2)
@@ -174,7 +177,8 @@ def tilt(beam: ArrayLike, triangulation_normal: ArrayLike, normal: ArrayLike) ->
     if not size > _PARALLEL_SINE:
         raise MethodError(
             "The triangulation normal lies along the beam; expected the normal of the plane of the emitted and the "
-            "received beam, which is perpendicular to the beam."
+            "received beam, which is perpendicular to the beam.",
+            code="beam.normal.along_beam",
         )
     e1 = first / size
     e2 = np.cross(u, e1)

@@ -101,7 +101,7 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
         )
         return solved if observed.finish is None else observed.finish(solved)
     except FitError as error:
-        raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.") from error
+        raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.", code=error.code) from error
 
 
 def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, Cleaned | None]:
@@ -172,7 +172,8 @@ def _contradiction(what: str, words: list[str]) -> MethodError:
     return MethodError(
         f"{what[:1].upper()}{what[1:]} contradict one another ({'; '.join(filter(None, words)) or 'no likely cause'}), "
         "and without what is wrong they do not determine the result. Correct the cause and measure again, or remove "
-        "what is wrong."
+        "what is wrong.",
+        code="readings.contradict",
     )
 
 

@@ -95,5 +95,6 @@ class ModelMethod(Method):
     ) -> Iterator[xr.Dataset]:
         """Refuse: the method measures nothing itself."""
         raise MethodError(
-            f"The method {self.info.id} evaluates imported data only: import a file of its readings, and identify it."
+            f"The method {self.info.id} evaluates imported data only: import a file of its readings, and identify it.",
+            code="method.imported_only",
         )

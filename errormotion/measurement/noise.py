@@ -208,7 +208,8 @@ def rounding_of(observed: Observed, problem: Problem, factor: float) -> Rounding
     if found is None and not problem.noise.stated and float(variance.max(initial=0.0)) <= smallest**2:
         raise FitError(
             f"{observed.what} do not scatter at all, and do not show the step of their scale: their uncertainty "
-            "is unknown. State their noise, or the resolution of the instrument"
+            "is unknown. State their noise, or the resolution of the instrument",
+            code="readings.noise.unknown",
         )
     return found
 

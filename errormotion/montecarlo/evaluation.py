@@ -112,7 +112,7 @@ class _Run:
         self._advance(len(values))
 
     def _lost(self, _number: int, reason: str) -> None:
-        raise RunError(f"A task of the Monte Carlo evaluation was lost: {reason}")
+        raise RunError(f"A task of the Monte Carlo evaluation was lost: {reason}", code="monte_carlo.task.lost")
 
     def _advance(self, trials: int) -> None:
         self.done += trials
@@ -180,11 +180,16 @@ def evaluate(
         The folder contains trials of another evaluation, or the scheduler does not work.
     """
     if trials is not None and trials < MIN_TRIALS:
-        raise MethodError(f"--monte-carlo: expected 'auto' or at least {MIN_TRIALS} trials; found {trials}")
+        raise MethodError(
+            f"--monte-carlo: expected 'auto' or at least {MIN_TRIALS} trials; found {trials}",
+            code="monte_carlo.trials.count",
+        )
     if digits not in (1, 2):
-        raise MethodError(f"--digits: expected 1 or 2 meaningful digits of an uncertainty; found {digits}")
+        raise MethodError(
+            f"--digits: expected 1 or 2 meaningful digits of an uncertainty; found {digits}", code="monte_carlo.digits"
+        )
     if seed < 0:
-        raise MethodError(f"--seed: expected 0 or a positive number; found {seed}")
+        raise MethodError(f"--seed: expected 0 or a positive number; found {seed}", code="monte_carlo.seed")
     method = plugins.get("methods", method_id)
     common = (str(Path(raw).resolve()), method_id, method.info.version, settings.model_dump_json(), __version__)
     with _quiet():
@@ -210,7 +215,10 @@ def evaluate(
         )
     if (summary.missing[np.isfinite(linear.ravel())] == summary.trials).any():
         reason = max(run.reasons, key=run.reasons.__getitem__, default="unknown")
-        raise MethodError(f"None of {summary.trials} trials had a value at all positions of the result: {reason}")
+        raise MethodError(
+            f"None of {summary.trials} trials had a value at all positions of the result: {reason}",
+            code="monte_carlo.no_values",
+        )
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
     found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
     if not keep:
@@ -247,7 +255,10 @@ def compute(*task: Any) -> tuple[Array, dict[str, int]]:
         (f"the method {given.method_id}", given.method_version, plugins.get("methods", given.method_id).info.version),
     ):
         if wanted != found:
-            raise RunError(f"expected {what} in version {wanted}; found {found} on a worker. Install it there.")
+            raise RunError(
+                f"expected {what} in version {wanted}; found {found} on a worker. Install it there.",
+                code="package.version.differs",
+            )
     with _quiet():
         method, redrawing, shape = _prepared(given.raw, given.method_id, given.method_version, given.settings)
         sequence = SeedSequence(given.seed, spawn_key=(given.block,))

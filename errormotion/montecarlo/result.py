@@ -128,7 +128,11 @@ def build(
     for name, (_, meaning) in TABLE.items():
         ds[name].attrs["long_name"] = meaning
     if wrong := violations(ds):
-        raise DatasetError(f"The result of the Monte Carlo evaluation does not conform to {SCHEMA}:", wrong)
+        raise DatasetError(
+            f"The result of the Monte Carlo evaluation does not conform to {SCHEMA}:",
+            wrong,
+            code="schema.violated",
+        )
     return ds
 
 

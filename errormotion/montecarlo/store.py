@@ -54,17 +54,22 @@ class Store:
                     ]
                     raise RunError(
                         f"{self.folder}: contains trials of another evaluation ({', '.join(differ)} differ). Remove "
-                        "the folder, or give another name to --out"
+                        "the folder, or give another name to --out",
+                        code="monte_carlo.folder.other",
                     )
             # A process that ended during its start leaves such a part.
             elif any(not is_part(each.name) for each in self.folder.iterdir()):
                 raise RunError(
-                    f"{self.folder}: expected an empty folder or trials of this evaluation; found other files"
+                    f"{self.folder}: expected an empty folder or trials of this evaluation; found other files",
+                    code="monte_carlo.folder.not_empty",
                 )
             else:
                 replace_text(file, json.dumps(self._key, indent=1))
         except (OSError, ValueError, RecursionError) as error:
-            raise RunError(f"{self.folder}: expected a writable folder for the trials; {error}") from error
+            raise RunError(
+                f"{self.folder}: expected a writable folder for the trials; {error}",
+                code="monte_carlo.folder.unwritable",
+            ) from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -100,7 +105,7 @@ class Store:
             whole = np.full((size, values.shape[1]), np.nan) if whole is None else whole
             whole[part.start : part.stop] = values
         if whole is None:
-            raise RunError(f"{self.folder}: the trials of block {number} are missing")
+            raise RunError(f"{self.folder}: the trials of block {number} are missing", code="monte_carlo.block.missing")
         self._save(self._block_file(number), whole)
         for file in files:
             file.unlink(missing_ok=True)

@@ -31,7 +31,8 @@ def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset
     if found is None:
         raise MethodError(
             f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it has "
-            "no 'redrawing'. Its linear uncertainty is not affected."
+            "no 'redrawing'. Its linear uncertainty is not affected.",
+            code="monte_carlo.method.no_redrawing",
         )
     check_centre((found.identify or method.identify)(found.raw, found.settings), errors)
     return found
@@ -43,7 +44,8 @@ def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:
     if one.shape != other.shape:
         raise MethodError(
             f"The result has {one.shape[0]} places from the reduced data and {other.shape[0]} from the measured data; "
-            "expected the same number. This is a defect of the redrawing of the method."
+            "expected the same number. This is a defect of the redrawing of the method.",
+            code="monte_carlo.redrawing.places",
         )
     u = linear_uncertainty(errors)
     known = np.isfinite(other)
@@ -51,7 +53,8 @@ def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:
     if wrong := int((known & (off | ~np.isfinite(one))).sum()):
         raise MethodError(
             f"The results from the reduced data and from the measured data differ at {wrong} of {int(known.sum())} "
-            "places and freedoms. This is a defect of the redrawing of the method."
+            "places and freedoms. This is a defect of the redrawing of the method.",
+            code="monte_carlo.redrawing.values",
         )
 
 

@@ -86,10 +86,13 @@ def kind(name: str) -> Any:
         found = point.load()
     except Exception as error:
         raise PluginError(
-            f"The kind '{name}' ({point.value}) does not load: {type(error).__name__}: {error}"
+            f"The kind '{name}' ({point.value}) does not load: {type(error).__name__}: {error}",
+            code="plugin.kind.not_loaded",
         ) from error
     if not getattr(found, "_is_protocol", False):
-        raise PluginError(f"The kind '{name}': expected a Protocol class at {point.value}; found {found!r}")
+        raise PluginError(
+            f"The kind '{name}': expected a Protocol class at {point.value}; found {found!r}", code="plugin.kind.form"
+        )
     return found
 
 

@@ -18,11 +18,13 @@ def load_object(path: str) -> Any:
     """
     module, colon, name = path.partition(":")
     if not colon:
-        raise PluginError(f"expected 'module:name', found '{path}'")
+        raise PluginError(f"expected 'module:name', found '{path}'", code="plugin.path.form")
     try:
         return getattr(import_module(module), name)
     except Exception as error:  # any exception of the import of a plugin
-        raise PluginError(f"'{path}' does not load: {type(error).__name__}: {error}") from error
+        raise PluginError(
+            f"'{path}' does not load: {type(error).__name__}: {error}", code="plugin.not_loaded"
+        ) from error
 
 
 def lazy(path: str) -> Any:

@@ -111,16 +111,25 @@ def _loaded(group: Group, point: EntryPoint) -> Plugin:
     kind, required = _REQUIRED[group]
     try:
         if not point.value:
-            raise PluginError("entry_points.txt cannot be read; expected sections with lines 'id = module:Class'")
+            raise PluginError(
+                "entry_points.txt cannot be read; expected sections with lines 'id = module:Class'",
+                code="plugin.entry_points.unreadable",
+            )
         cls = point.load()
         info = getattr(cls, "info", None)
         if not isinstance(info, kind):
-            raise PluginError(f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}")
+            raise PluginError(
+                f"{point.value}: expected a class with an `info` of type {kind.__name__}, found {info!r}",
+                code="plugin.info.form",
+            )
         if missing := [name for name in required if not _has(cls, name)]:
-            raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}")
+            raise PluginError(f"class {cls.__name__} lacks {', '.join(missing)}", code="plugin.members.missing")
         cls = adapted(cls, group)
         if info.id != point.name:
-            raise PluginError(f"the entry point is called '{point.name}', but the id of the class is '{info.id}'")
+            raise PluginError(
+                f"the entry point is called '{point.name}', but the id of the class is '{info.id}'",
+                code="plugin.id.differs",
+            )
     except (Exception, SystemExit) as error:  # noqa: BLE001 - a broken plugin affects no other plugin
         return Plugin(
             point.name,
@@ -165,12 +174,17 @@ def get(group: Group, plugin_id: str) -> Any:
         names = sorted({point.name for point in _found()[group]})
         near = get_close_matches(plugin_id, names, n=1)
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise PluginError(f"No {what} plugin '{plugin_id}'; available: {', '.join(names) or 'none'}.{hint}")
+        raise PluginError(
+            f"No {what} plugin '{plugin_id}'; available: {', '.join(names) or 'none'}.{hint}", code="plugin.unknown"
+        )
     if len(points) > 1:
-        raise PluginError(_rivals(group, plugin_id))
+        raise PluginError(_rivals(group, plugin_id), code="plugin.ambiguous")
     plugin = _loaded(group, points[0])
     if plugin.error:
-        raise PluginError(f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}")
+        raise PluginError(
+            f"The {what} plugin '{plugin_id}' ({plugin.distribution}) does not load: {plugin.error}",
+            code="plugin.not_loaded",
+        )
     return plugin.cls
 
 

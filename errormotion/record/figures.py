@@ -88,7 +88,9 @@ def figure_over_time(
         dated = dated[-MAX_VALUES:]
     freedom = FREEDOM.fullmatch(figure.strip())
     if at is not None and freedom is None:
-        raise RunError(f"--at: expected --figure with a freedom, such as EZ; found '{figure}'")
+        raise RunError(
+            f"--at: expected --figure with a freedom, such as EZ; found '{figure}'", code="figure.place.without_figure"
+        )
     names = {} if freedom else _names(dated, figure)
     found = list[Reading]()
     for path, entry in dated:
@@ -103,7 +105,10 @@ def figure_over_time(
             left_out.append(f"{entry.folder}: {type(error).__name__}: {error}")
     if not found:
         reasons = "".join(f"\n  - {reason}" for reason in left_out[:5])
-        raise RunError(f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(dated)}{reasons}")
+        raise RunError(
+            f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(dated)}{reasons}",
+            code="figure.no_value",
+        )
     return FigureOverTime(_series(found), figure, tuple(left_out), tuple(_remarks(found, at)))
 
 
@@ -128,12 +133,17 @@ def _names(runs: Sequence[tuple[Path, Entry]], figure: str) -> dict[Path, Figure
             own = [each for each in entry.figures or () if agrees(figure, each.name)]
             if len(own) > 1:
                 several = ", ".join(f"'{each.name}'" for each in own[:MAX_LISTED])
-                raise RunError(f"'{figure}' matches several figures of {entry.folder}: {several}. State one of them")
+                raise RunError(
+                    f"'{figure}' matches several figures of {entry.folder}: {several}. State one of them",
+                    code="figure.ambiguous",
+                )
             if own:
                 found[path] = own[0]
         if found:
             return found
-    raise RunError(f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(runs)}")
+    raise RunError(
+        f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(runs)}", code="figure.no_value"
+    )
 
 
 def _short(wanted: str, name: str) -> bool:
@@ -191,16 +201,18 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
     from errormotion import datasets
 
     if not entry.errors:
-        raise RunError("the run has no error dataset yet")
+        raise RunError("the run has no error dataset yet", code="run.no_errors")
     errors = datasets.load(path / entry.errors)
     name, minutes = freedom[1], freedom[2]
     origin = _origin(errors)
     if name not in errors.em.names:
-        raise DatasetError(f"has no {name}; its freedoms are {', '.join(errors.em.names)}")
+        raise DatasetError(
+            f"has no {name}; its freedoms are {', '.join(errors.em.names)}", code="errors.freedom.missing"
+        )
     errors, place = _at_place(errors, at)
     if minutes is not None:
         if errors.em.dims != ("time",):
-            raise DatasetError("has no errors over time, as 'after' requires")
+            raise DatasetError("has no errors over time, as 'after' requires", code="errors.time.missing")
         errors = errors.em.to_times([60.0 * float(minutes)])
         place = 0
     k = errors.em.names.index(name)
@@ -209,7 +221,8 @@ def _of_freedom(path: Path, entry: Entry, freedom: re.Match[str], at: Sequence[f
         known = np.flatnonzero(np.isfinite(values))
         if not known.size:
             raise DatasetError(
-                f"{name} is unknown{'' if at is None else ' at this point, because a rotation is unknown'}"
+                f"{name} is unknown{'' if at is None else ' at this point, because a rotation is unknown'}",
+                code="errors.freedom.value_unknown",
             )
         place = int(known[-1])
     u = errors.em.expanded(1.0).values.reshape(-1, len(errors.em.names))[place, k]
@@ -231,26 +244,34 @@ def _at_place(errors: xr.Dataset, at: Sequence[float] | None) -> tuple[xr.Datase
     if dims in ((), ("time",)):
         return (errors if at is None else errors.em.at(at)), (0 if dims == () else None)
     if at is None:
-        raise DatasetError(f"states errors over {', '.join(dims)}; state the place by --at")
+        raise DatasetError(
+            f"states errors over {', '.join(dims)}; state the place by --at", code="figure.place.required"
+        )
     own = [axis for axis in "xyz" if axis in errors.variables]
     if dims == ("position",):
         moving = [axis for axis in own if errors[axis].dims == dims]
         if len(moving) == 1:
             return errors.em.to_positions([at["xyz".index(moving[0])]], moving[0]), 0
     if len(dims) != 1 or len(own) < 3:
-        raise DatasetError(f"states errors over {', '.join(dims)} without x, y and z, so that no place can be found")
+        raise DatasetError(
+            f"states errors over {', '.join(dims)} without x, y and z, so that no place can be found",
+            code="figure.place.no_coordinates",
+        )
     away = np.sqrt(sum((errors[axis].values - at["xyz".index(axis)]) ** 2 for axis in own))
     nearest = int(np.nanargmin(away))
     if not away[nearest] <= MAX_DISTANCE:
-        raise DatasetError(f"its nearest position is {1e3 * away[nearest]:.1f} mm away from the requested place")
+        raise DatasetError(
+            f"its nearest position is {1e3 * away[nearest]:.1f} mm away from the requested place",
+            code="figure.place.too_far",
+        )
     return errors, nearest
 
 
 def _checked(value: float, u: float) -> float:
     if not np.isfinite(value):
-        raise DatasetError("the value is unknown")
+        raise DatasetError("the value is unknown", code="figure.value.unknown")
     if not (np.isfinite(u) and u > 0):
-        raise DatasetError("the uncertainty is unknown")
+        raise DatasetError("the uncertainty is unknown", code="figure.uncertainty.unknown")
     return u
 
 
@@ -271,7 +292,10 @@ def _series(found: list[Reading]) -> Series:
     """Return readings as a series; sources of a single run are part of its uncertainty."""
     units = {each.unit for each in found}
     if len(units) > 1:
-        raise RunError(f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only")
+        raise RunError(
+            f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only",
+            code="figure.units.several",
+        )
     counts = Counter(identity for each in found for identity, effect in each.influence.items() if effect)
     shared = sorted(identity for identity, count in counts.items() if count > 1)
     F = np.array([[each.influence.get(identity, 0.0) for each in found] for identity in shared])

@@ -94,7 +94,9 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
     followed = figure_over_time(runs.runs, figure, at)
     series = followed.series
     if series.unit not in UNITS:
-        raise RunError(f"'{figure}': expected a unit of {', '.join(UNITS)}; found '{series.unit}'")
+        raise RunError(
+            f"'{figure}': expected a unit of {', '.join(UNITS)}; found '{series.unit}'", code="history.unit.differs"
+        )
     model = model_of(series)
     limits = chart(series, model)
     zero, fit = series.time[0], model.fit
@@ -150,7 +152,7 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
         attrs["at"] = [float(each) for each in at]
     ds = xr.Dataset(variables, coords={"run": _texts(series.runs)}, attrs=attrs)
     if wrong := violations(ds):
-        raise DatasetError(f"The history does not conform to {SCHEMA}:", wrong)
+        raise DatasetError(f"The history does not conform to {SCHEMA}:", wrong, code="schema.violated")
     return ds
 
 

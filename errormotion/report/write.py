@@ -107,7 +107,7 @@ def write_report(
     target = page_file(Path(out))
     datasets = [errors] if isinstance(errors, xr.Dataset) else list(errors)
     if not datasets:
-        raise DatasetError("Expected at least one error dataset for a report; found none.")
+        raise DatasetError("Expected at least one error dataset for a report; found none.", code="report.no_datasets")
     sources, tolerances = [], from_run(run or {})
     for i, dataset in enumerate(datasets):
         _check_reportable(dataset)
@@ -136,7 +136,8 @@ def page_file(path: Path) -> Path:
     if path.suffix.lower() not in (".html", ".htm"):
         raise DatasetError(
             f"{path}: expected a name that ends in .html, that of the page; its PDF (--pdf), workbook and tables are "
-            "written beside it under the same name"
+            "written beside it under the same name",
+            code="report.name.ending",
         )
     return path
 
@@ -199,7 +200,8 @@ def chapters(source: Source) -> list[Part]:
         raise DatasetError(
             f"The chapter of {by} cannot be written from {file or 'this dataset'} ({type(error).__name__}: {error}). "
             "The dataset conforms to its schema, but contents that the plugin adds are missing or have another form. "
-            "If the dataset was not changed, this is a defect of the plugin: the traceback is in the log."
+            "If the dataset was not changed, this is a defect of the plugin: the traceback is in the log.",
+            code="report.chapter.failed",
         ) from error
 
 
@@ -286,11 +288,14 @@ def _kind_without_errors(dataset: xr.Dataset) -> str:
 def _check_reportable(dataset: xr.Dataset) -> None:
     missing = [name for name in (*FREEDOMS, "covariance") if name not in dataset]
     if missing and (kind := _kind_without_errors(dataset)):
-        raise DatasetError(f"A report is made from error datasets, or from a log; this is {kind}")
+        raise DatasetError(
+            f"A report is made from error datasets, or from a log; this is {kind}", code="report.dataset.kind"
+        )
     if missing and not _is_log(dataset):
         raise DatasetError(
             f"A report is made from error datasets, or from a log; this dataset lacks {', '.join(missing)}. "
-            "Identify the raw dataset first."
+            "Identify the raw dataset first.",
+            code="report.dataset.variables",
         )
 
 
@@ -326,13 +331,15 @@ def write_run_report(run_folder: Path, out: Path | None = None, *, form: Form = 
 
     folder = Path(run_folder)
     if not folder.is_dir():
-        raise RunError(f"Expected a run folder at {folder}; found none.")
+        raise RunError(f"Expected a run folder at {folder}; found none.", code="run.folder.not_found")
     files = [file for file in visible(folder, "errors/*/errors.nc") if not leaves(folder, file)]
     stored = folder / "raw.zarr"
     raw = load(stored) if stored.exists() and not leaves(folder, stored) else None
     log = raw if raw is not None and not files and _is_log(raw) else None
     if not files and log is None:
-        raise RunError(f"{folder} contains no errors/*/errors.nc. Run 'errormotion identify' first.")
+        raise RunError(
+            f"{folder} contains no errors/*/errors.nc. Run 'errormotion identify' first.", code="run.no_errors"
+        )
     run: dict[str, Any] = {}
     if os.path.lexists(folder / "run.json"):
         run = dict(read_run(folder))

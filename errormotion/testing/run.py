@@ -76,7 +76,9 @@ def run_checks(subject: Subject, only: Sequence[str] = ()) -> list[CheckResult]:
         if name not in names:
             near = get_close_matches(name, names, n=1)
             hint = f". Did you mean '{near[0]}'?" if near else ""
-            raise PluginError(f"There is no check '{name}'; expected one of {', '.join(names)}{hint}")
+            raise PluginError(
+                f"There is no check '{name}'; expected one of {', '.join(names)}{hint}", code="check.unknown"
+            )
     return [run_check(check, subject) for check in checks if not only or check.name in only]
 
 
@@ -119,18 +121,25 @@ def subjects_of(group: Group, plugin_id: str, *, address: str | None = None) -> 
         stated = load_object(cls.conformance) if isinstance(cls.conformance, str) else _maker(cls)()
         subjects = stated if isinstance(stated, tuple) else (stated,)
         if not all(isinstance(subject, Subject) for subject in subjects):
-            raise PluginError(f"The attribute conformance of '{plugin_id}': expected {_EXPECTED.get(group, 'subject')}")
+            raise PluginError(
+                f"The attribute conformance of '{plugin_id}': expected {_EXPECTED.get(group, 'subject')}",
+                code="check.conformance.form",
+            )
     if not subjects and group == "methods":
         raise PluginError(
             f"The method '{plugin_id}' states no subject for the checks; expected an attribute conformance = "
-            "'module:name' of its class, with a MethodSubject."
+            "'module:name' of its class, with a MethodSubject.",
+            code="check.subject.missing",
         )
     if not subjects:
         if group == "datasets":
-            raise PluginError(f"'{plugin_id}' is a kind of dataset; the kit has no checks for these.")
+            raise PluginError(
+                f"'{plugin_id}' is a kind of dataset; the kit has no checks for these.", code="check.kind.none"
+            )
         if address is None and not cls.info.simulator:
             raise PluginError(
-                f"The {group.rstrip('s')} '{plugin_id}' has no simulator; give the address of a real one."
+                f"The {group.rstrip('s')} '{plugin_id}' has no simulator; give the address of a real one.",
+                code="check.simulator.missing",
             )
         subjects = (CompensatorSubject(cls) if group == "compensators" else InstrumentSubject(cls, SIMULATED),)
     return subjects if address is None else tuple(replace(subject, address=address) for subject in subjects)

@@ -160,5 +160,5 @@ def from_run(run: Mapping[str, Any]) -> Tolerances | None:
         return None
     table, mistakes = tomlfile.check(run["tolerances"], Tolerances, prefix=("tolerances",), edge=False)
     if table is None:
-        raise BenchError(tomlfile.report("run.json", mistakes))
+        raise BenchError(tomlfile.report("run.json", mistakes), code="run.file.mistakes")
     return table

@@ -202,5 +202,8 @@ def machine_kind(machine: str | MachineDescription) -> tuple[str, MachineKind]:
         name = "gantry" if machine.tool_axes == "XYZ" else "cframe"
         return name, replace(KINDS[name], name=machine.name, travel=machine.travel, chain=machine.chain)
     if machine not in KINDS:
-        raise BenchError(f"expected a virtual machine, {' or '.join(KINDS)}, or a description; found '{machine}'")
+        raise BenchError(
+            f"expected a virtual machine, {' or '.join(KINDS)}, or a description; found '{machine}'",
+            code="virtual.machine.unknown",
+        )
     return machine, KINDS[machine]

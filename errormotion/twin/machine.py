@@ -148,9 +148,12 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         """
         t, values = np.asarray(times, dtype=float), np.asarray(offsets, dtype=float)
         if t.ndim != 1 or values.shape != (t.size, 3) or t.size == 0:
-            raise BenchError(f"expected times (n,) and offsets (n, 3); found {t.shape} and {values.shape}")
+            raise BenchError(
+                f"expected times (n,) and offsets (n, 3); found {t.shape} and {values.shape}",
+                code="virtual.offsets.shape",
+            )
         if not np.isfinite(t).all() or not np.isfinite(values).all() or not (np.diff(t) > 0).all():
-            raise BenchError("expected finite offsets at increasing times")
+            raise BenchError("expected finite offsets at increasing times", code="virtual.offsets.not_finite")
         self._follow(self._events, (t, values))
 
     def _follow(self, schedule: Sequence[Event], offset: tuple[Array, Array] | None) -> None:
@@ -250,7 +253,10 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         They are stated at the machine's origin; those of a rotary axis at the point of its line in the description.
         """
         if axis not in self.geometry.motions:
-            raise BenchError(f"expected one of the axes {', '.join(self.geometry.motions)}; found {axis!r}")
+            raise BenchError(
+                f"expected one of the axes {', '.join(self.geometry.motions)}; found {axis!r}",
+                code="virtual.axis.unknown",
+            )
         q = _times(positions)
         (joint,) = (each for each in self.geometry.machine.joints if each.name == axis)
         coords = {axis.lower(): ("position", q, {"units": "rad" if joint.rotary else "m"})}
@@ -321,7 +327,10 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
             m; NaN outside of the measuring range and where a beam misses the target.
         """
         if first < 0 or n < 0 or not rate > 0:
-            raise BenchError(f"expected first >= 0, n >= 0 and a rate above 0 Hz; found {first}, {n}, {rate} Hz")
+            raise BenchError(
+                f"expected first >= 0, n >= 0 and a rate above 0 Hz; found {first}, {n}, {rate} Hz",
+                code="virtual.samples.count",
+            )
         chosen = self._chosen(channels)
         out = np.full((chosen.size, n), np.nan)
         if tool == "bar":
@@ -329,14 +338,20 @@ class VirtualMachine(StageSensor, ProbeMeasurements):
         elif tool == "sphere" and motion is not None:
             self._sensing.read_sphere(out, first, float(rate), chosen, motion)
         else:
-            raise BenchError(f"expected the tool 'bar', or 'sphere' with a StepProgram; found {tool!r}, {motion!r}")
+            raise BenchError(
+                f"expected the tool 'bar', or 'sphere' with a StepProgram; found {tool!r}, {motion!r}",
+                code="virtual.tool.unknown",
+            )
         return out
 
     def _chosen(self, channels: Sequence[str] | None) -> NDArray[np.int64]:
         names = self.frame.channels if channels is None else tuple(channels)
         unknown = [name for name in names if name not in self.frame.channels]
         if unknown:
-            raise BenchError(f"expected channels of {', '.join(self.frame.channels)}; found {', '.join(unknown)}")
+            raise BenchError(
+                f"expected channels of {', '.join(self.frame.channels)}; found {', '.join(unknown)}",
+                code="virtual.channels.unknown",
+            )
         return np.array([self.frame.channels.index(name) for name in names], dtype=np.int64)
 
 

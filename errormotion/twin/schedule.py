@@ -77,11 +77,12 @@ class StepProgram:
         start, direction = _vector(self.start, "start"), _vector(self.direction, "direction")
         length = float(np.linalg.norm(direction))
         if length == 0:
-            raise BenchError("expected a direction of the steps; found (0, 0, 0)")
+            raise BenchError("expected a direction of the steps; found (0, 0, 0)", code="virtual.steps.direction")
         if self.count < 1 or self.dwell <= 0 or self.travel <= 0 or self.approach <= 0:
             raise BenchError(
                 "expected at least one position and positive dwell, travel and approach times; found "
-                f"count = {self.count}, dwell = {self.dwell} s, travel = {self.travel} s, approach = {self.approach} s"
+                f"count = {self.count}, dwell = {self.dwell} s, travel = {self.travel} s, approach = {self.approach} s",
+                code="virtual.steps.form",
             )
         line = start + np.arange(self.count)[:, None] * self.step * (direction / length)
         home = (line[0] + line[-1]) / 2 if self.home is None else _vector(self.home, "home")
@@ -144,14 +145,22 @@ class Schedule:
     def _check(self) -> None:
         times = [event.time for event in self.events]
         if any(time < 0 or not np.isfinite(time) for time in times) or sorted(times) != times:
-            raise BenchError(f"expected events at finite times from 0 on, in order; found {times} s")
+            raise BenchError(
+                f"expected events at finite times from 0 on, in order; found {times} s", code="virtual.events.times"
+            )
         for event in self.events:
             speed = event.spindle_speed
             if speed is not None and not 0 <= speed <= self.top_speed:
-                raise BenchError(f"The spindle turns at 0 to {self.top_speed:g} /min; found {speed:g} /min")
+                raise BenchError(
+                    f"The spindle turns at 0 to {self.top_speed:g} /min; found {speed:g} /min",
+                    code="virtual.spindle.too_fast",
+                )
             unknown = set(event.compensation or {}) - {"X", "Y", "Z"}
             if unknown:
-                raise BenchError(f"expected compensation of the axes X, Y and Z; found {', '.join(sorted(unknown))}")
+                raise BenchError(
+                    f"expected compensation of the axes X, Y and Z; found {', '.join(sorted(unknown))}",
+                    code="virtual.compensation.axes",
+                )
 
     def _spin(self) -> None:
         """Compute the phases: constant acceleration up to each commanded speed, then constant speed."""
@@ -225,5 +234,7 @@ class Schedule:
 def _vector(value: Any, name: str) -> Array:
     vector = np.asarray(value, dtype=float)
     if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise BenchError(f"expected '{name}' as three finite numbers (x, y, z) in m; found {value!r}")
+        raise BenchError(
+            f"expected '{name}' as three finite numbers (x, y, z) in m; found {value!r}", code="virtual.point.form"
+        )
     return vector

@@ -70,7 +70,8 @@ class Table:
                 apart = one.reach[1] - one.position + other.position - other.reach[0]
                 raise BenchError(
                     f"expected pieces {apart * 1e3:.0f} mm or more apart along Y; found {one.artefact.name} at "
-                    f"{one.position:g} m and {other.artefact.name} at {other.position:g} m"
+                    f"{one.position:g} m and {other.artefact.name} at {other.position:g} m",
+                    code="virtual.pieces.too_close",
                 )
         object.__setattr__(self, "targets", tuple(ordered))
 

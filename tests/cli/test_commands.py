@@ -203,8 +203,31 @@ def test_an_error_is_one_message_with_the_traceback_in_the_log(run: Run, answer:
     assert "Traceback" not in result.stderr
     assert "Traceback" in (tmp_path / "state" / "errormotion" / "errormotion.log").read_text()
     error = answer("identify", "nothing.nc", "--method", "spindle_drift", "--out", "errors.nc", code=1)["error"]
+    assert error["code"] == "file.unreadable"
     assert error["type"] == "DatasetError"
     assert error["exit_code"] == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "status"),
+    [
+        (["identify", "--nonsense"], "option.unknown", 2),
+        (["run"], "option.missing", 2),
+        (["run", "none.toml"], "toml.unreadable", 1),
+        (["bench", "validate", "none.toml"], "toml.unreadable", 3),
+        (["validate", "none.nc"], "file.violations", 3),
+        (["plugins", "show", "nothing"], "plugin.unknown", 1),
+        (["history", "none", "--machine", "x", "--figure", "y", "--at", "1,2"], "option.form", 2),
+        (["demo", "--controller", "none"], "option.choice", 2),
+        (["compensate", "status", "none"], "compensation.folder.other", 1),
+        (["note", "none", "text"], "run.folder.not_found", 1),
+        (["plugins", "check", "r_test", "--only", "nothing"], "check.unknown", 1),
+    ],
+)
+def test_a_failure_states_its_code_as_json(answer: Answer, words: list[str], code: str, status: int) -> None:
+    found = answer(*words, code=status)
+    assert (found["ok"], found["error"]["code"]) == (False, code)
+    assert found["error"]["message"]
 
 
 def test_an_internal_error_has_a_specific_exit_code_and_names_the_log(

@@ -60,7 +60,7 @@ def test_nothing_is_read_without_the_token(open_to_the_network: Any, path: str) 
     status, headers, text = open_to_the_network.ask(path)
     assert (status, headers["Location"], text) == (302, "/login", "")
     status, _, text = open_to_the_network.ask(path, Accept="application/json")
-    assert (status, json.loads(text)) == (403, {"error": "The token is required"})
+    assert (status, json.loads(text)) == (403, {"error": "The token is required", "code": "request.forbidden"})
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/login", "/static/dashboard.css"])
@@ -133,6 +133,7 @@ def test_the_figure_follows_the_functional_point(open_to_this_computer: Any, key
         status, found = figure(**wrong)
         assert status == 400
         assert "expected" in found["error"]
+        assert found["code"] in ("request.point.form", "request.index.outside", "errors.point.form")
 
 
 def test_values_and_data_are_sent_whole(open_to_this_computer: Any, runs: Path, key: str) -> None:

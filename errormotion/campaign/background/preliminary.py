@@ -38,13 +38,15 @@ def preliminary(folder: RunFolder) -> xr.Dataset:
     """
     test = _test(folder)
     if not samples(folder):
-        raise RunError(f"{folder.path.name}: the run has no samples yet")
+        raise RunError(f"{folder.path.name}: the run has no samples yet", code="run.no_samples")
     with looking_beside(Path(str(folder.data["campaign"].get("folder", folder.path)))):
         try:
             with datasets.load(folder.raw) as raw:
                 errors = noted(test.method().identify(raw, test.settings).load(), raw)
         except (ArithmeticError, LookupError, ValueError) as error:  # an incomplete record is no defect of the method
-            raise DatasetError(f"the samples so far do not determine the errors ({error})") from error
+            raise DatasetError(
+                f"the samples so far do not determine the errors ({error})", code="raw.preliminary.undetermined"
+            ) from error
     datasets.validate(errors)
     return errors
 
@@ -53,4 +55,6 @@ def _test(folder: RunFolder) -> TestPlan:
     try:
         return next(test for test in stored_plan(folder).tests if test.name == folder.data["test"])
     except (StopIteration, KeyError, TypeError, AttributeError):
-        raise RunError(f"{folder.path}: expected the run folder of a campaign; found another folder") from None
+        raise RunError(
+            f"{folder.path}: expected the run folder of a campaign; found another folder", code="run.folder.other"
+        ) from None

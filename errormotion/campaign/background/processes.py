@@ -148,7 +148,9 @@ def resume(folder: Path, release: Release = refuse) -> str:
     try:
         plan = stored_plan(first)
     except (KeyError, TypeError, AttributeError):
-        raise RunError(f"{folder}: expected the run folder of a campaign; found another folder") from None
+        raise RunError(
+            f"{folder}: expected the run folder of a campaign; found another folder", code="run.folder.other"
+        ) from None
     tests = to_measure(plan, folders_of(first, [test.name for test in plan.tests]))
     return _start(folder.parent, plan, tests, ["--resume", str(folder.resolve())], release)
 
@@ -170,7 +172,7 @@ def answer(runs: Path, name: str, number: int) -> None:
     """
     process = _one(runs, name)
     if not process.alive or process.request is None or process.request.number != number:
-        raise RunError(f"{process.campaign}: request {number} is no longer open")
+        raise RunError(f"{process.campaign}: request {number} is no longer open", code="process.request.closed")
     replace_text(runs / FOLDER / name / ANSWER, f"{number}\n")
 
 
@@ -187,21 +189,24 @@ def stop(runs: Path, name: str) -> None:
     folder = runs / FOLDER / name
     state = _state(folder / "process.json")
     if not process.alive:
-        raise RunError(f"{process.campaign}: the process has already ended")
+        raise RunError(f"{process.campaign}: the process has already ended", code="process.ended")
     requested = folder / "stop"
     if requested.exists() and time.time() - requested.stat().st_mtime < STOP_INTERVAL:
         return  # a second signal would end it while it closes its instruments
     try:
         signals.terminate(state.get("pid"), state.get("began"), [*COMMAND, *_publishing(folder)])
     except ProcessLookupError:
-        raise RunError(f"{process.campaign}: the process has already ended") from None
+        raise RunError(f"{process.campaign}: the process has already ended", code="process.ended") from None
     except signals.OtherProcessError as error:
         raise RunError(
             f"{folder / 'process.json'}: expected the process that measures in this folder; {error}. Nothing was "
-            "stopped. If the campaign is running, end it by Ctrl-C in its terminal, or by 'kill' with its number"
+            "stopped. If the campaign is running, end it by Ctrl-C in its terminal, or by 'kill' with its number",
+            code="process.record.unreadable",
         ) from None
     except OSError as error:
-        raise RunError(f"{process.campaign}: cannot be stopped: {error.strerror}") from error
+        raise RunError(
+            f"{process.campaign}: cannot be stopped: {error.strerror}", code="process.not_stopped"
+        ) from error
     replace_text(requested, "")
 
 
@@ -209,7 +214,10 @@ def _start(
     runs: Path, plan: CampaignPlan, tests: Sequence[TestPlan], arguments: Sequence[str], release: Release
 ) -> str:
     if fcntl is None:
-        raise RunError("A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.")
+        raise RunError(
+            "A background process needs a system with file locks (Linux, macOS). Use 'errormotion run'.",
+            code="process.no_locks",
+        )
     machine = plan.bench.machine
     require_ready(plan, tests, stored="--resume" in arguments)
     if tests:
@@ -221,11 +229,17 @@ def _start(
         root = runs / FOLDER
         root.mkdir(mode=0o700, exist_ok=True)
         if root.is_symlink():
-            raise RunError(f"{root}: expected a folder; found a link, and links are not written through. Remove it")
+            raise RunError(
+                f"{root}: expected a folder; found a link, and links are not written through. Remove it",
+                code="runs.folder.link",
+            )
         with _exclusive(root):
             for each in found(runs):
                 if each.alive and each.machine == machine:
-                    raise RunError(f"'{each.campaign}' has used {machine} since {each.started}; stop it first")
+                    raise RunError(
+                        f"'{each.campaign}' has used {machine} since {each.started}; stop it first",
+                        code="process.machine.used",
+                    )
             _tidy(root)
             name = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid4().hex[:8]}"
             folder = root / name
@@ -233,7 +247,9 @@ def _start(
             store_released(folder, motions, "" if "--resume" in arguments else plan.sha256)
             _spawn(folder, runs, {"campaign": plan.name, "machine": machine, "started": now()}, arguments)
     except OSError as error:
-        raise RunError(f"{runs}: the process cannot be started: {error.strerror}") from error
+        raise RunError(
+            f"{runs}: the process cannot be started: {error.strerror}", code="process.not_started"
+        ) from error
     return name
 
 
@@ -277,7 +293,7 @@ def _tidy(root: Path) -> None:
 def _one(runs: Path, name: str) -> Background:
     process = _read(runs / FOLDER / name) if _NAME.fullmatch(name) else None
     if process is None:
-        raise RunError(f"{runs}: no process {name[:60]!r}")
+        raise RunError(f"{runs}: no process {name[:60]!r}", code="process.not_found")
     return process
 
 

@@ -52,7 +52,8 @@ def released_in(folder: Path, sha256: str) -> Callable[[Sequence[str]], None]:
         if stated != {"motions": list(motions), "sha256": sha256}:
             raise RunError(
                 "Nothing has moved, and nothing was created: the motions are not those that were released, since the "
-                "campaign or its bench file has changed meanwhile. Check the motions, and start it again."
+                "campaign or its bench file has changed meanwhile. Check the motions, and start it again.",
+                code="motions.changed",
             )
 
     return release

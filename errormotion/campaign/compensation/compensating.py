@@ -145,26 +145,38 @@ class Compensation:
         machine, frame = str(model.attrs.get("machine", "unknown")), str(model.attrs.get("frame", "unknown"))
         if arm is not None and arm != self.plan.machine:
             raise CompensationError(
-                f"--arm {arm}: the machine of {self.plan.source} is '{self.plan.machine}'. Nothing was written."
+                f"--arm {arm}: the machine of {self.plan.source} is '{self.plan.machine}'. Nothing was written.",
+                code="compensation.arm.other_machine",
             )
         if arm is not None and self.plan.compensator is None:
-            raise CompensationError(f"{self.plan.source}: expected a table [compensator] to write offsets; found none.")
+            raise CompensationError(
+                f"{self.plan.source}: expected a table [compensator] to write offsets; found none.",
+                code="compensation.compensator.missing",
+            )
         if machine != self.plan.machine:
             raise CompensationError(
-                f"The model is for the machine '{machine}'; the machine of the bench is '{self.plan.machine}'."
+                f"The model is for the machine '{machine}'; the machine of the bench is '{self.plan.machine}'.",
+                code="compensation.machine.other",
             )
         if frame != FRAME:
             raise CompensationError(
-                f"The model states errors in the frame '{frame}'; offsets need the frame '{FRAME}'."
+                f"The model states errors in the frame '{frame}'; offsets need the frame '{FRAME}'.",
+                code="compensation.frame.other",
             )
 
     def _check_inputs(self) -> None:
         absent = [name for name in self._predictor.temperatures if name not in self._monitor.sensors]
         if absent:
             found = ", ".join(self._monitor.sensors) or "none"
-            raise BenchError(f"{self.plan.source}: the model needs the temperatures {', '.join(absent)}; found {found}")
+            raise BenchError(
+                f"{self.plan.source}: the model needs the temperatures {', '.join(absent)}; found {found}",
+                code="bench.temperatures.missing",
+            )
         if (needed := self._predictor.parameters) and self._monitor.controller is None:
-            raise BenchError(f"{self.plan.source}: the model needs {', '.join(needed)}; found no controller")
+            raise BenchError(
+                f"{self.plan.source}: the model needs {', '.join(needed)}; found no controller",
+                code="bench.controller.missing",
+            )
 
     def _replay(self, earlier: xr.Dataset) -> float:
         """Update the predictor with the readings of a log; return the time since its last row, s."""
@@ -172,12 +184,14 @@ class Compensation:
         if math.isnan(passed):
             raise CompensationError(
                 "The time since the earlier readings is unknown, because the clocks of their log and of this computer "
-                "contradict each other. Start on a cold machine, without --since."
+                "contradict each other. Start on a cold machine, without --since.",
+                code="compensation.clock.unknown",
             )
         times = np.asarray(earlier["time"].values, dtype=float) - passed
         if not times.size or not times[-1] < 0:
             raise CompensationError(
-                "The log of the earlier readings ends in the future: its clock or that of this computer is wrong."
+                "The log of the earlier readings ends in the future: its clock or that of this computer is wrong.",
+                code="compensation.clock.future",
             )
         names = [str(name) for name in earlier["sensor"].values]
         temperature = np.asarray(earlier["temperature"].transpose("time", "sensor").values, dtype=float)

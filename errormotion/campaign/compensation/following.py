@@ -136,9 +136,14 @@ def read_status(folder: Path) -> Status:
     try:
         return Status.model_validate_json(read_bytes(path, MAX_STATUS))
     except OSError as error:
-        raise CompensationError(f"{path}: the state of the compensation cannot be read: {error.strerror}") from None
+        raise CompensationError(
+            f"{path}: the state of the compensation cannot be read: {error.strerror}",
+            code="compensation.state.unreadable",
+        ) from None
     except ValidationError as error:
-        raise CompensationError(f"{path}: expected the state of a compensation: {error.errors()[0]['msg']}") from None
+        raise CompensationError(
+            f"{path}: expected the state of a compensation: {error.errors()[0]['msg']}", code="compensation.state.form"
+        ) from None
 
 
 def is_working(folder: Path) -> bool:
@@ -171,12 +176,16 @@ def request_stop(folder: Path) -> None:
         The compensation is not running, or the request cannot be written.
     """
     if not is_working(folder):
-        raise CompensationError(f"{folder}: no compensation is running in this folder; there is nothing to stop.")
+        raise CompensationError(
+            f"{folder}: no compensation is running in this folder; there is nothing to stop.",
+            code="compensation.not_running",
+        )
     try:
         os.close(open_to_append(folder / STOP))
     except OSError as error:
         raise CompensationError(
-            f"{folder / STOP}: cannot be written: {error.strerror}. Stop the command by Ctrl-C in its terminal."
+            f"{folder / STOP}: cannot be written: {error.strerror}. Stop the command by Ctrl-C in its terminal.",
+            code="compensation.stop.unwritable",
         ) from None
 
 

@@ -119,7 +119,7 @@ def with_field(text: str, place: Sequence[Key], written: str) -> str:
     known = {each.place: each for _, _, fields in _groups(data) for each in fields}
     found = known.get(tuple(place))
     if found is None:
-        raise DatasetError(f"{dotted(place)}: no such field")
+        raise DatasetError(f"{dotted(place)}: no such field", code="form.field.unknown")
     if written.strip() == "" and not (found.required and found.plain):
         return with_value(text, place, None)
     return with_value(text, place, written if found.plain else value_of(written.strip()))

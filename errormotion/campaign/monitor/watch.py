@@ -132,7 +132,7 @@ class Monitor:
         if not self.sources or len(controllers) > 1:
             found = ", ".join(source.name for source in controllers) or ", ".join(plan.kinds)
             wanted = "thermometers, a controller, or both" if not self.sources else "one controller at most"
-            raise BenchError(f"{plan.source}: expected {wanted}; found {found}")
+            raise BenchError(f"{plan.source}: expected {wanted}; found {found}", code="monitor.quantities.missing")
         self.controller = controllers[0] if controllers else None
         self._columns = _columns([source for source in self.sources if source is not self.controller])
         self.sensors = tuple(self._columns.values())

@@ -40,7 +40,10 @@ def motions(plan: CampaignPlan, test: TestPlan) -> Motions:
     """
     steps = steps_of(test.method, test.settings, plan.bench.chosen(test.instruments).settings_by_kind)
     if steps is None:
-        raise BenchError(f"{plan.source}: {test.name}: {NO_MOTIONS.format(test.method.info.id)}. Nothing has moved.")
+        raise BenchError(
+            f"{plan.source}: {test.name}: {NO_MOTIONS.format(test.method.info.id)}. Nothing has moved.",
+            code="motions.none",
+        )
     return Motions(test.name, steps, extent(steps))
 
 

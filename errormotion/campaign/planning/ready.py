@@ -44,7 +44,7 @@ def require_ready(
             ". It would be continued with the files of its start, which are in the run folder: correct the bench, and "
             "start a new run without --resume"
         )
-    raise BenchError("\n  - ".join([f"{what}:", *found]))
+    raise BenchError("\n  - ".join([f"{what}:", *found]), code="bench.not_ready")
 
 
 def cannot_continue(test: TestPlan) -> str:
@@ -89,7 +89,8 @@ def accept_overdue(
     if ask is None:
         raise BenchError(
             f"{' '.join(found)} Nothing was opened, nothing was created. Calibrate, and correct [calibrated_until] of "
-            f"{plan.bench.source}; or, to measure nevertheless, run the command in a terminal, or with --yes."
+            f"{plan.bench.source}; or, to measure nevertheless, run the command in a terminal, or with --yes.",
+            code="bench.calibration.overdue",
         )
     ask(request)
 

@@ -47,7 +47,8 @@ def refuse(motions: Sequence[str]) -> None:
                 f"asks; or add {OPTION}, which releases them without a question. (--yes releases no motion.)",
                 *(f"  - {line}" for line in motions),
             ]
-        )
+        ),
+        code="motions.not_released",
     )
 
 
@@ -66,7 +67,8 @@ def require_word(found: str) -> None:
     if found.strip() != WORD:
         raise RunError(
             f"Nothing has moved, and nothing was created: expected the word '{WORD}', which releases the motions; "
-            f"found '{found.strip()[:40]}'."
+            f"found '{found.strip()[:40]}'.",
+            code="motions.not_released",
         )
 
 

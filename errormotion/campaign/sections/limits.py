@@ -157,7 +157,8 @@ def steps_of(method: Any, settings: Any, instruments: dict[str, Any]) -> list[St
         if not isinstance(step, Step) or not _possible(step):
             raise MethodError(
                 f"motions of '{method.info.id}': expected steps with finite positions X, Y, Z (NaN for an axis that "
-                f"does not move), feeds above 0 (NaN for rapid) and finite spindle speeds; found step {number}: {step}"
+                f"does not move), feeds above 0 (NaN for rapid) and finite spindle speeds; found step {number}: {step}",
+                code="method.motions.form",
             )
     return steps
 

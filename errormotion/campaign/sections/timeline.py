@@ -67,4 +67,7 @@ def follower(instruments: Any) -> Any:
     for each in instruments:
         if hasattr(each, "follow"):
             return each
-    raise BenchError("[timeline]: expected a controller of a virtual machine on the bench, whose clock can be set")
+    raise BenchError(
+        "[timeline]: expected a controller of a virtual machine on the bench, whose clock can be set",
+        code="bench.timeline.no_clock",
+    )

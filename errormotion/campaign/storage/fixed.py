@@ -55,7 +55,10 @@ class Fixed:
         """
         dataset = open_zarr(path)
         if dataset is None:
-            raise RunError(f"{path}: expected an array format that this version writes; found another one")
+            raise RunError(
+                f"{path}: expected an array format that this version writes; found another one",
+                code="store.array.format",
+            )
         return cls(path, dim, dims, {name: dataset.variables[name].load() for name in names})
 
     @property
@@ -86,14 +89,16 @@ class Fixed:
             what = "new" if more[0] in fixed else "missing"
             raise RunError(
                 f"{self.path}: expected the variables of the first dataset that do not grow {self._along} "
-                f"({expected}); '{more[0]}' is {what}. {_REMEDY}"
+                f"({expected}); '{more[0]}' is {what}. {_REMEDY}",
+                code="store.variables.fixed",
             )
         for name, variable in fixed.items():
             before = self.variables[name]
             if variable.dims != before.dims or not _equal(variable.values, before.values):
                 raise RunError(
                     f"{self.path}: '{name}' does not grow {self._along}, and differs from the first dataset: "
-                    f"expected {_described(before)}; found {_described(variable)}. {_REMEDY}"
+                    f"expected {_described(before)}; found {_described(variable)}. {_REMEDY}",
+                    code="store.variables.fixed",
                 )
         for name, variable in stored.items():
             before_attrs = growing[name] if name in growing else self.variables[name].attrs
@@ -106,7 +111,8 @@ class Fixed:
             if key not in before or not _same(before[key], value):
                 raise RunError(
                     f"{self.path}: the attribute '{key}' of {what} differs from the first dataset: expected "
-                    f"{before.get(key)!r:.100}; found {value!r:.100}. {_REMEDY}"
+                    f"{before.get(key)!r:.100}; found {value!r:.100}. {_REMEDY}",
+                    code="store.attributes.differ",
                 )
 
 

@@ -72,7 +72,7 @@ def journal(path: Path, level: int = logging.INFO) -> Iterator[None]:
         The file is a link.
     """
     if path.is_symlink():
-        raise RunError(f"{path}: is a link, and links are not written through; remove it")
+        raise RunError(f"{path}: is a link, and links are not written through; remove it", code="journal.link")
     logger = logging.getLogger(ROOT)
     handler = _Handler(path, encoding="utf-8", delay=True)
     handler.setFormatter(JsonLines())

@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 class DiskFullError(RunError):
     """The disk is full."""
 
+    code = "store.disk.full"
+
 
 class Recorder:
     """Writes datasets in the background, at least twice a second.
@@ -157,10 +159,15 @@ class Recorder:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFullError(f"The disk is full: {self._saved()} are stored in {self._path}.") from error
         if isinstance(error, OSError):
-            raise RunError(f"{self._path} cannot be written: {error.strerror}; {self._saved()} are stored.") from error
+            raise RunError(
+                f"{self._path} cannot be written: {error.strerror}; {self._saved()} are stored.",
+                code="store.unwritable",
+            ) from error
         if isinstance(error, RunError):
             raise error
-        raise RunError(f"The recorder of {self._path} stopped: {type(error).__name__}: {error}") from error
+        raise RunError(
+            f"The recorder of {self._path} stopped: {type(error).__name__}: {error}", code="store.recorder.stopped"
+        ) from error
 
     def _saved(self) -> str:
         text = f"{self.committed} along '{self._dim}'"

@@ -100,7 +100,9 @@ class RawStore:
         self._tracks: list[_Track] = []
         for each, columns in arrays.items():
             if not columns:
-                raise RunError(f"{path}: expected at least one variable along '{each}'; found none")
+                raise RunError(
+                    f"{path}: expected at least one variable along '{each}'; found none", code="store.dim.missing"
+                )
             length = committed_length(path, each)
             self._tracks.append(_Track(each, columns, next(iter(columns.values())).block, length, length))
         self._arrays = {name: column for track in self._tracks for name, column in track.arrays.items()}
@@ -145,16 +147,21 @@ class RawStore:
             Further dimensions that grow.
         """
         if not path.parent.is_dir():  # otherwise zarr would create it
-            raise RunError(f"{path.parent} is gone: it was moved or deleted before data were written to it")
+            raise RunError(
+                f"{path.parent} is gone: it was moved or deleted before data were written to it", code="run.folder.gone"
+            )
         dims = (dim, *others)
         for each in dims:
             if each not in first.dims:
                 raise RunError(
-                    f"expected data along '{each}'; the method yielded dims {', '.join(map(str, first.dims))}"
+                    f"expected data along '{each}'; the method yielded dims {', '.join(map(str, first.dims))}",
+                    code="method.data.dim",
                 )
         for name, variable in stored_variables(first, dim).items():
             if variable.dtype.kind not in _KINDS and not is_text(variable):
-                raise RunError(f"expected numbers or texts; '{name}' has the type {variable.dtype}")
+                raise RunError(
+                    f"expected numbers or texts; '{name}' has the type {variable.dtype}", code="method.data.type"
+                )
         stored = stored_variables(first, dim)
         along = {name: each for name, variable in stored.items() if (each := _growing(name, variable.dims, dims))}
         growing = {name: stored[name] for name in along}
@@ -209,14 +216,17 @@ class RawStore:
             The data cannot be written.
         """
         if self.dim not in chunk.dims:
-            raise RunError(f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}")
+            raise RunError(
+                f"expected data along '{self.dim}'; the method yielded {dict(chunk.sizes)}", code="method.data.dim"
+            )
         dims = [track.dim for track in self._tracks]
         values = {name: self._encoded(name, variable) for name, variable in stored_variables(chunk, self.dim).items()
                   if _growing(name, variable.dims, dims)}  # fmt: skip
         if set(values) != set(self._arrays):
             raise RunError(
                 f"{self.path}: expected the variables {', '.join(sorted(self._arrays))} along "
-                f"{' and '.join(repr(dim) for dim in dims)}; the method yielded {', '.join(sorted(values))}"
+                f"{' and '.join(repr(dim) for dim in dims)}; the method yielded {', '.join(sorted(values))}",
+                code="method.data.variables",
             )
         self._fixed.check(chunk, {name: column.attributes for name, column in self._arrays.items()}, self.attrs)
         self._check_continues(chunk)
@@ -307,24 +317,29 @@ class RawStore:
     def _encoded(self, name: str, variable: xr.Variable) -> np.ndarray:
         if name not in self._arrays:
             raise RunError(
-                f"{self.path}: the method yielded the variable '{name}', which is missing in its first dataset"
+                f"{self.path}: the method yielded the variable '{name}', which is missing in its first dataset",
+                code="method.data.variables",
             )
         column = self._arrays[name]
         along = column.dims[column.axis]
         expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != along}
         found = {str(d): n for d, n in variable.sizes.items() if d != along}
         if found != expected:
-            raise RunError(f"{self.path}: '{name}' has the sizes {found}; expected {expected}")
+            raise RunError(
+                f"{self.path}: '{name}' has the sizes {found}; expected {expected}", code="method.data.sizes"
+            )
         if not (column.packing or fits(variable, column.dtype)):
             raise RunError(
                 f"{self.path}: expected '{name}' of the type {column.dtype}, as in the first dataset; found "
-                f"{variable.dtype}"
+                f"{variable.dtype}",
+                code="method.data.type",
             )
         packed = encode(variable.transpose(*column.dims), column.packing)
         if packed is None:
             raise RunError(
                 f"{self.path}: expected '{name}' in integer steps of {column.packing['scale_factor']!r}, as the "
-                "encoding states; found other values. Correct the encoding in the instrument or method, or omit it."
+                "encoding states; found other values. Correct the encoding in the instrument or method, or omit it.",
+                code="method.data.steps",
             )
         return packed
 
@@ -338,7 +353,8 @@ class RawStore:
             if abs((last - first) * rate - (chunk.sizes["time"] - 1)) > 0.5:
                 raise RunError(
                     f"{self.path}: expected {chunk.sizes['time']} samples at {rate} Hz; their times are from "
-                    f"{first:.6f} s to {last:.6f} s. The method must fill gaps with NaN."
+                    f"{first:.6f} s to {last:.6f} s. The method must fill gaps with NaN.",
+                    code="method.data.times",
                 )
         if start is None:
             return
@@ -346,7 +362,8 @@ class RawStore:
         if self.count and abs(start - expected) * rate > 0.5:
             raise RunError(
                 f"{self.path}: expected the next samples at {expected:.6f} s; the method yielded samples from "
-                f"{start:.6f} s. The method must fill gaps with NaN."
+                f"{start:.6f} s. The method must fill gaps with NaN.",
+                code="method.data.times",
             )
 
     def _add_counts(self, attrs: Mapping[Any, Any]) -> None:
@@ -362,7 +379,10 @@ def _growing(name: str, of: Sequence[Hashable], dims: Sequence[str]) -> str:
     """Return the growing dimension of a variable; empty if it has none."""
     found = [dim for dim in dims if dim in of]
     if len(found) > 1:
-        raise RunError(f"expected '{name}' along one of {', '.join(dims)}, which grow independently; found two")
+        raise RunError(
+            f"expected '{name}' along one of {', '.join(dims)}, which grow independently; found two",
+            code="method.data.dim",
+        )
     return found[0] if found else ""
 
 
@@ -386,9 +406,9 @@ def committed_length(path: Path, dim: str) -> int:
                     return length
         raise ValueError(f"no variable has a length along '{dim}'")
     except OSError as error:
-        raise RunError(f"{file}: cannot be read: {error.strerror}") from error
+        raise RunError(f"{file}: cannot be read: {error.strerror}", code="run.file.unreadable") from error
     except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise RunError(f"{file}: is damaged; restore it from a copy ({error})") from error
+        raise RunError(f"{file}: is damaged; restore it from a copy ({error})", code="run.file.damaged") from error
 
 
 def _array_metadata(path: Path, root: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -39,13 +39,15 @@ def run(
         The bench file or the interval is invalid.
     """
     if find_spec("bokeh") is None:
-        raise RunError("The dashboard needs the package bokeh: pip install 'errormotion[dashboard]'")
+        raise RunError(
+            "The dashboard needs the package bokeh: pip install 'errormotion[dashboard]'", code="package.missing"
+        )
     try:
         step = TIME.parse(interval)
     except ValueError as error:
-        raise BenchError(f"--interval: {error}") from None
+        raise BenchError(f"--interval: {error}", code="option.form") from None
     if not step >= MIN_INTERVAL:
-        raise BenchError(f"--interval: expected {MIN_INTERVAL:g} s or more; found '{interval}'")
+        raise BenchError(f"--interval: expected {MIN_INTERVAL:g} s or more; found '{interval}'", code="option.outside")
     from errormotion.dashboard.access import Access, is_loopback
     from errormotion.dashboard.server import Options, run
 

@@ -116,19 +116,24 @@ def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:
     if ds["EX"].dims != ("target",):
         raise DatasetError(
             f"'{name}': the errors of {axis} can be derived only from errors of the tool at targets in the volume; "
-            f"these errors depend on {dims}"
+            f"these errors depend on {dims}",
+            code="compare.axis.not_derivable",
         )
     if "chain" not in ds.attrs:
         raise DatasetError(
             f"'{name}': no attribute 'chain' (such as workpiece-X-Y-bed-Z-spindle-tool), so that the errors of {axis} "
-            "cannot be derived from those of the volume. State it (--chain)"
+            "cannot be derived from those of the volume. State it (--chain)",
+            code="compare.chain.missing",
         )
     axes = parse_chain(str(ds.attrs["chain"]))
     if axis not in axes:
-        raise DatasetError(f"'{name}': its chain {ds.attrs['chain']} has no axis {axis}")
+        raise DatasetError(f"'{name}': its chain {ds.attrs['chain']} has no axis {axis}", code="compare.chain.no_axis")
     missing = [each for each in axes if each not in "XYZ" or each.lower() not in ds.variables]
     if missing:
-        raise DatasetError(f"'{name}': its targets state no commanded position of {', '.join(missing)}")
+        raise DatasetError(
+            f"'{name}': its targets state no commanded position of {', '.join(missing)}",
+            code="compare.targets.no_position",
+        )
 
 
 def in_machine(ds: xr.Dataset) -> xr.Dataset:
@@ -149,7 +154,8 @@ def _check_reference(name: str, ds: xr.Dataset, volume_name: str, volume: xr.Dat
     raise DatasetError(
         f"'{one[0]}' states changes since a reference state ({one[1].attrs['reference']}), '{other[0]}' errors against "
         f"the commanded positions ({other[1].attrs['reference']}): measure '{other[0]}' in the reference state as well "
-        "and subtract it (ds.em.change_from(before), --change NAME=AFTER,BEFORE)"
+        "and subtract it (ds.em.change_from(before), --change NAME=AFTER,BEFORE)",
+        code="compare.reference.differs",
     )
 
 
@@ -160,7 +166,8 @@ def _at_instant(
     if ds["EX"].dims not in (("time", "position"), ("position", "time"), ("position",)):
         found = ", ".join(map(str, ds["EX"].dims)) or "nothing"
         raise DatasetError(
-            f"'{name}': expected errors over position, optionally also over time; they depend on {found}"
+            f"'{name}': expected errors over position, optionally also over time; they depend on {found}",
+            code="compare.dims.not_positions",
         )
     if "time" not in ds["EX"].dims:
         return ds
@@ -169,7 +176,9 @@ def _at_instant(
     if silent and not same_start:
         raise DatasetError(
             f"{', '.join(map(repr, silent))}: no attribute 'start' (UTC of time 0), so that the time of '{name}' "
-            f"that corresponds to '{volume_name}' is unknown. State it, or use the last time (same_start, --same-start)"
+            f"that corresponds to '{volume_name}' is unknown. State it, or use the last time (same_start, "
+            "--same-start)",
+            code="compare.start.missing",
         )
     wanted = t[-1] if silent else between(str(ds.attrs["start"]), str(volume.attrs["start"]))
     k = int(np.abs(t - wanted).argmin())
@@ -177,7 +186,8 @@ def _at_instant(
     if not t[0] - step <= wanted <= t[-1] + step:
         raise DatasetError(
             f"'{volume_name}' starts {wanted:.0f} s after the start of '{name}', which covers {t[0]:.0f} s to "
-            f"{t[-1]:.0f} s: they do not overlap in time"
+            f"{t[-1]:.0f} s: they do not overlap in time",
+            code="compare.times.no_overlap",
         )
     notes.append(f"'{name}' at {t[k]:.0f} s, {abs(t[k] - wanted):.0f} s from the start of '{volume_name}'.")
     one = ds.isel(time=k).drop_vars(["time", "time_index"], errors="ignore")
@@ -188,7 +198,9 @@ def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.D
     """Return the positions that all datasets of the axis have in common and that are within all volumes."""
     for name, ds in axes.items():
         if letter not in ds.variables or ds[letter].dims != ("position",):
-            raise DatasetError(f"'{name}': no coordinate {letter} along the dimension position")
+            raise DatasetError(
+                f"'{name}': no coordinate {letter} along the dimension position", code="compare.coordinate.missing"
+            )
     found = np.sort(np.asarray(next(iter(axes.values()))[letter].values, dtype=float))
     for ds in axes.values():
         found = np.array([q for q in found if (np.abs(ds[letter].values - q) <= SAME).any()])
@@ -199,7 +211,8 @@ def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.D
     if found.size < 2:
         raise DatasetError(
             f"{', '.join(map(repr, axes))}: {found.size} positions of {letter} in common within the volume; expected "
-            "at least two, since errors are not extrapolated"
+            "at least two, since errors are not extrapolated",
+            code="compare.positions.few_common",
         )
     return found
 

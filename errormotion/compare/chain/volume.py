@@ -62,7 +62,10 @@ def predict(
     names = [dof + axis for dof in DOF]
     seen = np.array([found.distinguished(name) for name in names])
     if not seen.any():
-        raise DatasetError(f"'{name}': its targets do not determine the errors of {axis}; measure more targets")
+        raise DatasetError(
+            f"'{name}': its targets do not determine the errors of {axis}; measure more targets",
+            code="compare.targets.undetermined",
+        )
     S = np.stack([found.design(each, positions) for each in names], axis=1)
     if notes is not None:
         notes.append(

@@ -85,7 +85,10 @@ class Correction:
         """
         point = np.array(functional_point, dtype=float)
         if point.shape != (3,) or not np.isfinite(point).all():
-            raise DatasetError(f"functional point: expected three finite coordinates in m; found {functional_point!r}")
+            raise DatasetError(
+                f"functional point: expected three finite coordinates in m; found {functional_point!r}",
+                code="errors.point.form",
+            )
         fields = tuple(field.for_tool(point) for field in self.fields)
         if not self.partial:
             _check_rotations(fields)
@@ -123,7 +126,8 @@ class Correction:
             worst = positions[int(np.abs(offset).max(axis=1).argmax())]
             raise DatasetError(
                 f"The errors change too fast with the position to be inverted: the correction near {worst.tolist()} "
-                f"m does not converge (last change {1e6 * change:g} um). Check the errors"
+                f"m does not converge (last change {1e6 * change:g} um). Check the errors",
+                code="correction.not_invertible",
             )
         valid, turn = np.ones(len(positions), dtype=bool), np.zeros(positions.shape)
         for field, each in zip(self.fields, weights, strict=True):
@@ -198,14 +202,17 @@ def correction(
     """
     sources = [source] if isinstance(source, (xr.Dataset, ThermalModel)) else list(source)
     if not sources:
-        raise DatasetError("Expected an error dataset or a thermal model; found none")
+        raise DatasetError("Expected an error dataset or a thermal model; found none", code="correction.no_source")
     fields: list[Field] = []
     notes: list[str] = []
     for number, each in enumerate(sources, start=1):
         name = _name(each, number if len(sources) > 1 else 0)
         if isinstance(each, ThermalModel):
             if data is None:
-                raise DatasetError(f"{name}: a thermal model needs the temperatures over time (data, --temperatures)")
+                raise DatasetError(
+                    f"{name}: a thermal model needs the temperatures over time (data, --temperatures)",
+                    code="correction.temperatures.missing",
+                )
             each = each.predict(data)
         field, remarks = field_of(each, name, chain)
         fields.append(field)
@@ -215,7 +222,8 @@ def correction(
     if part and not partial:
         raise DatasetError(
             f"{', '.join(part)}: unknown in {'the source' if len(fields) == 1 else 'at least one source'}. Use a "
-            "source that states them, or omit unknown freedoms (partial, --partial)"
+            "source that states them, or omit unknown freedoms (partial, --partial)",
+            code="correction.freedoms.unknown",
         )
     if part:
         notes.append(f"Unknown, and not corrected: {', '.join(part)}.")
@@ -234,7 +242,8 @@ def _check_rotations(fields: Sequence[Field]) -> None:
             raise DatasetError(
                 f"{field.name}: {_unknown(missing)} and displace{'s' if len(missing) == 1 else ''} the tool at the "
                 f"functional point {np.round(field.point, 6).tolist()} m or along the travel. Use the functional point "
-                "of the measurement, or a source that states the rotations"
+                "of the measurement, or a source that states the rotations",
+                code="correction.rotations.unknown",
             )
 
 
@@ -263,10 +272,16 @@ def _sum(parts: Iterable[Array]) -> Array:
 def _points(positions: ArrayLike, time: ArrayLike | None) -> tuple[Array, Array | None]:
     positions = np.asarray(positions, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != 3 or not np.isfinite(positions).all():
-        raise DatasetError(f"positions: expected finite coordinates (n, 3) in m; found shape {positions.shape}")
+        raise DatasetError(
+            f"positions: expected finite coordinates (n, 3) in m; found shape {positions.shape}",
+            code="correction.positions.shape",
+        )
     if time is None:
         return positions, None
     times = np.asarray(time, dtype=float)
     if times.shape not in ((), (len(positions),)) or not np.isfinite(times).all():
-        raise DatasetError(f"time: expected a finite number or ({len(positions)},) in s; found shape {times.shape}")
+        raise DatasetError(
+            f"time: expected a finite number or ({len(positions)},) in s; found shape {times.shape}",
+            code="correction.time.shape",
+        )
     return positions, np.broadcast_to(times, (len(positions),))

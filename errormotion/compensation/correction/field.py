@@ -74,7 +74,10 @@ class Field:
         if self.instants is None:
             return found
         if time is None:
-            raise DatasetError(f"{self.name}: the errors depend on time; state the time of each point (s)")
+            raise DatasetError(
+                f"{self.name}: the errors depend on time; state the time of each point (s)",
+                code="correction.time.missing",
+            )
         return self.instants.weights(time[:, None]).times(found, self.nodes.size)
 
     def displacement(self, positions: Array, weights: Weights) -> Array:
@@ -150,12 +153,15 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
     F = influence_of(arranged.transpose("source", ..., missing_dims="ignore")).reshape(-1, *shape, 6)
     known = np.isfinite(E).any(axis=(0, 1))
     if not known.any():
-        raise DatasetError(f"{name}: all errors are unknown; nothing can be corrected")
+        raise DatasetError(f"{name}: all errors are unknown; nothing can be corrected", code="correction.no_errors")
     lost = ~np.isfinite(E[..., known]).all(axis=-1)
     times = ~lost.all(axis=1)
     kept = ~lost[times].any(axis=0)
     if not kept.any():
-        raise DatasetError(f"{name}: no position has known errors at all times; select one time (--select time=NUMBER)")
+        raise DatasetError(
+            f"{name}: no position has known errors at all times; select one time (--select time=NUMBER)",
+            code="correction.positions.unknown",
+        )
     notes = []
     if gaps := int((~times).sum()):
         notes.append(f"{name}: {gaps} of {shape[0]} times have no known errors; interpolated from their neighbours.")
@@ -187,28 +193,39 @@ def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:
 
 def _check(ds: xr.Dataset, name: str) -> None:
     if ds.attrs.get("schema") != SCHEMA:
-        raise DatasetError(f"{name}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}")
+        raise DatasetError(
+            f"{name}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}", code="schema.other"
+        )
     if "deviation" in ds.variables:
-        raise DatasetError(f"{name}: the errors are known along one direction only and cannot be corrected")
+        raise DatasetError(
+            f"{name}: the errors are known along one direction only and cannot be corrected",
+            code="correction.freedoms.one_direction",
+        )
     if ds.attrs["component"] == "beam":
-        raise DatasetError(f"{name}: the errors are those of beams, not of the machine")
+        raise DatasetError(
+            f"{name}: the errors are those of beams, not of the machine", code="correction.errors.of_beams"
+        )
     dims = [str(dim) for dim in ds["EX"].dims]
     if not set(dims) <= {"time", "position", "target"} or {"position", "target"} <= set(dims):
         raise DatasetError(
             f"{name}: expected errors over time, position, target, or time and one of these; found "
-            f"({', '.join(dims)}). Select one value of the others (--select DIM=NUMBER)"
+            f"({', '.join(dims)}). Select one value of the others (--select DIM=NUMBER)",
+            code="correction.dims.other",
         )
     if ds.attrs["frame"] != "machine" and "frame_origin" not in ds.attrs:
         raise DatasetError(
             f"{name}: expected errors in machine coordinates; found the frame '{ds.attrs['frame']}'. Transform them "
-            "(ds.em.in_frame), or state its origin (attribute frame_origin) if its directions are those of the machine"
+            "(ds.em.in_frame), or state its origin (attribute frame_origin) if its directions are those of the machine",
+            code="correction.frame.other",
         )
 
 
 def _line(ds: xr.Dataset, coordinate: str, kept: NDArray[np.bool_], name: str) -> Line:
     values = np.asarray(ds[coordinate].values, dtype=float)[kept]
     if not np.isfinite(values).all() or (np.diff(values) <= 0).any():
-        raise DatasetError(f"{name}: {coordinate}: expected finite values that increase")
+        raise DatasetError(
+            f"{name}: {coordinate}: expected finite values that increase", code="errors.coordinate.not_increasing"
+        )
     return Line(values)
 
 
@@ -226,19 +243,23 @@ def _nodes(
         if len(found) != 1:
             raise DatasetError(
                 f"{name}: expected one coordinate x, y or z along 'position', that of the component "
-                f"{ds.attrs['component']}; found {', '.join('xyz'[k] for k in found) or 'none'}"
+                f"{ds.attrs['component']}; found {', '.join('xyz'[k] for k in found) or 'none'}",
+                code="correction.coordinate.ambiguous",
             )
         position = np.asarray(ds["xyz"[found[0]]].values, dtype=float)
         rows = rows[np.argsort(position[rows], kind="stable")]
         kept = position[rows]
         if not np.isfinite(kept).all() or (np.diff(kept) <= 0).any():
-            raise DatasetError(f"{name}: expected finite positions that differ")
+            raise DatasetError(f"{name}: expected finite positions that differ", code="correction.positions.not_finite")
         return Line(kept), (found[0],), rows
     if len(found) != 3:
-        raise DatasetError(f"{name}: expected x, y and z of the targets; found {', '.join('xyz'[k] for k in found)}")
+        raise DatasetError(
+            f"{name}: expected x, y and z of the targets; found {', '.join('xyz'[k] for k in found)}",
+            code="correction.coordinate.missing",
+        )
     targets = np.stack([np.asarray(ds[axis].values, dtype=float) for axis in "xyz"], axis=1)[rows]
     if not np.isfinite(targets).all():
-        raise DatasetError(f"{name}: expected finite x, y and z of the targets")
+        raise DatasetError(f"{name}: expected finite x, y and z of the targets", code="correction.positions.not_finite")
     nodes, order = of_targets(targets)
     return nodes, (0, 1, 2), rows[order]
 
@@ -261,9 +282,9 @@ def _lever(ds: xr.Dataset, point: Array, chain: str, place: str, name: str) -> t
     try:
         carries_tool = parse_chain(chain)
     except ValueError as error:
-        raise DatasetError(f"{name}: {error}") from error
+        raise DatasetError(f"{name}: {error}", code="correction.chain.form") from error
     if component not in carries_tool:
-        raise DatasetError(f"{name}: the chain {chain} has no axis {component}")
+        raise DatasetError(f"{name}: the chain {chain} has no axis {component}", code="correction.chain.no_axis")
     behind = list(carries_tool)[list(carries_tool).index(component) + 1 :]
     # The point of such an axis is fixed to the body on the workpiece side: its own travel changes the lever.
     if not carries_tool[component]:

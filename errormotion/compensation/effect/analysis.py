@@ -64,7 +64,9 @@ def effect(
     """
     results = {"before": before, "after": after}
     if planned := [name for name, ds in results.items() if is_planned(ds)]:
-        raise DatasetError(f"'{planned[0]}': a plan contains no measured errors; expected a measurement")
+        raise DatasetError(
+            f"'{planned[0]}': a plan contains no measured errors; expected a measurement", code="effect.dataset.planned"
+        )
     ground = common_ground(_aligned(results), at=at, freedoms=freedoms, since=since)
     names = [*ground.freedoms]
     groups: list[tuple[tuple[int, ...], str]] = [((k,), name) for k, name in enumerate(names)]

@@ -55,7 +55,8 @@ def own_key() -> bytes:
     except (OSError, ValueError) as error:
         raise CompensationError(
             f"{state_folder() / KEY}: expected the key of audit logs, a file of this user that no other user can read "
-            f"(mode 0600); {error}"
+            f"(mode 0600); {error}",
+            code="audit.key.form",
         ) from None
 
 

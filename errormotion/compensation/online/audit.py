@@ -63,8 +63,8 @@ class Verdict(StrEnum):
 class AuditError(CompensationError):
     """An audit log is broken; ``verdict`` states how."""
 
-    def __init__(self, verdict: Verdict, message: str) -> None:
-        super().__init__(message)
+    def __init__(self, verdict: Verdict, message: str, *, code: str) -> None:
+        super().__init__(message, code=code)
         self.verdict = verdict
 
 
@@ -113,7 +113,9 @@ class AuditLog:
         if path.exists() and (path.stat().st_size or anchors.of_path(path)):
             verify(path, self._reader)
             if self._reader.count and self._reader.verdict is not Verdict.UNBROKEN:
-                raise CompensationError(f"{path}: the log was written with another key or none; start a new one")
+                raise CompensationError(
+                    f"{path}: the log was written with another key or none; start a new one", code="audit.key.other"
+                )
         self._log = self._reader.log or secrets.token_hex(16)
         self._count, self._hash = self._reader.count, self._reader.hash
         self._synced, self._saved = time.monotonic(), -1
@@ -123,7 +125,9 @@ class AuditLog:
             self._sync()
         except OSError as error:
             os.close(self._file)
-            raise CompensationError(f"{path}: the number of its entries cannot be stored: {error}") from None
+            raise CompensationError(
+                f"{path}: the number of its entries cannot be stored: {error}", code="audit.anchor.unwritable"
+            ) from None
 
     def __enter__(self) -> Self:
         return self
@@ -159,7 +163,9 @@ class AuditLog:
             if sync or last or time.monotonic() - self._synced > SYNC_INTERVAL:
                 self._sync()
         except OSError as error:
-            raise CompensationError(f"{self.path}: the audit log cannot be written: {error}") from None
+            raise CompensationError(
+                f"{self.path}: the audit log cannot be written: {error}", code="audit.unwritable"
+            ) from None
 
     def _sync(self) -> None:
         """Wait until the entries are on the disk, then store their number: it never exceeds that of the file."""
@@ -231,7 +237,9 @@ class AuditReader:
             require_regular(self.path)
             with self.path.open("rb") as file:
                 if file.seek(0, os.SEEK_END) < self._at:
-                    raise self._broken(Verdict.CUT, "the file is shorter than it was: its end was cut off")
+                    raise self._broken(
+                        Verdict.CUT, "the file is shorter than it was: its end was cut off", code="audit.cut"
+                    )
                 file.seek(self._at)
                 while len(found) < most and (line := file.readline(MAX_LINE)):
                     if not line.endswith(b"\n") and len(line) < MAX_LINE and not whole:
@@ -241,10 +249,10 @@ class AuditReader:
                     self._at += len(line)
         except FileNotFoundError as error:
             if known is not None:
-                raise self._broken(Verdict.EMPTIED, "the log was removed") from None
-            raise CompensationError(f"{self.path}: cannot be read: {error.strerror}") from None
+                raise self._broken(Verdict.EMPTIED, "the log was removed", code="audit.emptied") from None
+            raise CompensationError(f"{self.path}: cannot be read: {error.strerror}", code="audit.unreadable") from None
         except OSError as error:
-            raise CompensationError(f"{self.path}: cannot be read: {error.strerror}") from None
+            raise CompensationError(f"{self.path}: cannot be read: {error.strerror}", code="audit.unreadable") from None
         if len(found) < most:
             self._require_all(known or self._elsewhere(), partial)
         return found
@@ -274,16 +282,26 @@ class AuditReader:
         """Compare the log with what is known of it outside of its file; ``partial`` lines are being written."""
         if known is None:
             if not self.count and not partial:
-                raise self._broken(Verdict.EMPTIED, "expected entries; found none: the log was emptied")
+                raise self._broken(
+                    Verdict.EMPTIED, "expected entries; found none: the log was emptied", code="audit.emptied"
+                )
             return
         own = self._key is not None or anchors.known_key() is None  # without a key nothing proves another log
         if self.count and (self.log != known.log or not own):
-            raise self._broken(Verdict.ALTERED, "expected the log that this user began here; found another one")
+            raise self._broken(
+                Verdict.ALTERED, "expected the log that this user began here; found another one", code="audit.altered"
+            )
         if self.count + partial == 0 < known.entries:
-            raise self._broken(Verdict.EMPTIED, f"expected {known.entries} entries; found none: the log was emptied")
+            raise self._broken(
+                Verdict.EMPTIED,
+                f"expected {known.entries} entries; found none: the log was emptied",
+                code="audit.emptied",
+            )
         if self.count + partial < known.entries:
             raise self._broken(
-                Verdict.CUT, f"expected at least {known.entries} entries; found {self.count}: its end was cut off"
+                Verdict.CUT,
+                f"expected at least {known.entries} entries; found {self.count}: its end was cut off",
+                code="audit.cut",
             )
 
     def _elsewhere(self) -> Anchor | None:
@@ -294,11 +312,13 @@ class AuditReader:
 
     def _altered(self, what: str) -> AuditError:
         return self._broken(
-            Verdict.ALTERED, f"line {self.count + 1} {what}: the log was altered, or its last line was cut off"
+            Verdict.ALTERED,
+            f"line {self.count + 1} {what}: the log was altered, or its last line was cut off",
+            code="audit.altered",
         )
 
-    def _broken(self, verdict: Verdict, what: str) -> AuditError:
-        return AuditError(verdict, f"{self.path}: {what}. Keep it, and start a new one.")
+    def _broken(self, verdict: Verdict, what: str, *, code: str) -> AuditError:
+        return AuditError(verdict, f"{self.path}: {what}. Keep it, and start a new one.", code=code)
 
 
 def verify(path: Path, reader: AuditReader | None = None) -> tuple[int, str]:

@@ -116,14 +116,18 @@ class Follower:
             It is armed already, or the offset of the machine is unknown or beyond the limit.
         """
         if self.state not in (State.OFF, State.FAULT):
-            raise CompensationError(f"The compensation is {self.state} already.")
+            raise CompensationError(f"The compensation is {self.state} already.", code="compensation.state.other")
         values = np.asarray(applied, dtype=float)
         if values.shape != (3,) or not np.isfinite(values).all():
-            raise CompensationError("The present offset of the machine is unknown; it is required before a change.")
+            raise CompensationError(
+                "The present offset of the machine is unknown; it is required before a change.",
+                code="compensation.offset.unknown",
+            )
         if (np.abs(values) > self.limits.limit * (1 + 1e-9)).any():
             raise CompensationError(
                 f"The machine has an offset of {_um(values)} um, beyond the limit of {self.limits.limit * 1e6:g} um. "
-                "Ramp it to zero first."
+                "Ramp it to zero first.",
+                code="compensation.offset.beyond_limit",
             )
         self.stopping = self.stopping and self.state is State.FAULT
         self.state, self.offset = State.ARMED, np.clip(values, -self.limits.limit, self.limits.limit)

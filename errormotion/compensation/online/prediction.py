@@ -103,6 +103,9 @@ def predictor(model: xr.Dataset, functional_point: Array | None = None) -> Predi
     schema = str(model.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)
     if not predicts(schema):
-        raise CompensationError(f"Expected a model that predicts errors from readings; found the schema '{schema}'")
+        raise CompensationError(
+            f"Expected a model that predicts errors from readings; found the schema '{schema}'",
+            code="schema.other",
+        )
     found: Predictor = owner().predictor(model, functional_point)
     return found

@@ -121,9 +121,11 @@ def compensate(
     """
     chosen = settings or Settings()
     if chosen.route not in ROUTES:
-        raise ProgramError(f"reader '{chosen.route}': expected one of {', '.join(ROUTES)}")
+        raise ProgramError(
+            f"reader '{chosen.route}': expected one of {', '.join(ROUTES)}", code="program.reader.unknown"
+        )
     if require_regular(program).st_size > MAX_PROGRAM:
-        raise ProgramError(f"{program}: expected a file of at most {MAX_PROGRAM} bytes")
+        raise ProgramError(f"{program}: expected a file of at most {MAX_PROGRAM} bytes", code="program.too_long")
     why = ""
     with replacing(out) as beside:
         if chosen.route != "interpreter":
@@ -135,12 +137,15 @@ def compensate(
                 why = str(error)
         try:
             if chosen.unit != "mm":
-                raise ProgramError("LinuxCNC's interpreter starts in mm: state the unit in the program (G20)")
+                raise ProgramError(
+                    "LinuxCNC's interpreter starts in mm: state the unit in the program (G20)",
+                    code="program.unit.unknown",
+                )
             source = [text for _, text in lines_of(_lines(program))]
             screen(source)
             return _written(program, source, beside, correcting, offsets, chosen, head, why)
         except ProgramError as error:
-            raise ProgramError(f"{error}" + (f"\nThe plain reader: {why}" if why else "")) from error
+            raise ProgramError(f"{error}" + (f"\nThe plain reader: {why}" if why else ""), code=error.code) from error
 
 
 def _expanded(source: list[str], expansion: Expansion, offsets: Offsets, settings: Settings) -> Generator[str]:
@@ -172,7 +177,7 @@ def _written(
     except BlockError as error:
         if source is None or not error.line:
             raise
-        raise refusal(error.line, source[error.line - 1], error.why) from error
+        raise refusal(error.line, source[error.line - 1], error.why, code=error.code) from error
     if expansion is not None and source is not None:
         rewriting.summary.after_end = _after_end(source, expansion.end)
     checked = 0
@@ -192,7 +197,7 @@ def _written(
                 deleted=settings.deleted,
             )
         except ProgramError as error:
-            raise ProgramError(f"the check of the new program: {error}") from error
+            raise ProgramError(f"the check of the new program: {error}", code=error.code) from error
     route = "plain" if source is None else "interpreter"
     notes = _not_kept(source or [], offsets)
     return Outcome(rewriting.summary, route, why, checked, _digest(program), notes)
@@ -246,7 +251,9 @@ def _lines(path: Path) -> Generator[str]:
             while line := file.readline(MAX_LINE + 3):
                 yield line
     except UnicodeDecodeError as error:
-        raise ProgramError(f"{path}: expected text in UTF-16, as its byte order mark states: {error.reason}") from None
+        raise ProgramError(
+            f"{path}: expected text in UTF-16, as its byte order mark states: {error.reason}", code="program.encoding"
+        ) from None
 
 
 def _encoding(path: Path) -> str:

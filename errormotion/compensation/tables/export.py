@@ -51,7 +51,10 @@ class Exported:
         """
         paths = {folder / name: content for name, content in self.files.items()}
         if existing := [str(path) for path in paths if path.exists()]:
-            raise DatasetError(f"{existing[0]} already exists: choose another folder (--out), or remove the file")
+            raise DatasetError(
+                f"{existing[0]} already exists: choose another folder (--out), or remove the file",
+                code="table.file.exists",
+            )
         folder.mkdir(parents=True, exist_ok=True)
         for path, content in paths.items():
             with path.open("xb") as file:

@@ -41,17 +41,27 @@ def get(name: str) -> TableFormat:
     if not points:
         near = get_close_matches(name, available(), n=1)
         hint = f" Did you mean '{near[0]}'?" if near else ""
-        raise PluginError(f"Unknown table format '{name}'; available: {', '.join(available()) or 'none'}.{hint}")
+        raise PluginError(
+            f"Unknown table format '{name}'; available: {', '.join(available()) or 'none'}.{hint}",
+            code="table.format.unknown",
+        )
     if Counter(point.name for point in _points())[name] > 1:
         sources = ", ".join(point.dist.name if point.dist else "unknown" for point in points)
-        raise PluginError(f"Several distributions provide the format '{name}': {sources}. Remove all but one.")
+        raise PluginError(
+            f"Several distributions provide the format '{name}': {sources}. Remove all but one.",
+            code="table.format.ambiguous",
+        )
     try:
         cls = points[0].load()
         if missing := [each for each in _REQUIRED if not hasattr(cls, each)]:
-            raise PluginError(f"the class lacks {', '.join(missing)}")
+            raise PluginError(f"the class lacks {', '.join(missing)}", code="table.format.members")
         found: TableFormat = cls()
     except (Exception, SystemExit) as error:
-        raise PluginError(f"The format '{name}' cannot be loaded: {type(error).__name__}: {error}") from error
+        raise PluginError(
+            f"The format '{name}' cannot be loaded: {type(error).__name__}: {error}", code="table.format.not_loaded"
+        ) from error
     if found.id != name:
-        raise PluginError(f"The entry point is named '{name}', but its format has the id '{found.id}'")
+        raise PluginError(
+            f"The entry point is named '{name}', but its format has the id '{found.id}'", code="table.format.id"
+        )
     return found

@@ -128,11 +128,13 @@ def axis_table(
     component = component or axis
     for what, letter in (("axis", axis), ("component", component)):
         if letter not in _AXES:
-            raise DatasetError(f"{what}: expected X, Y or Z; found '{letter}'")
+            raise DatasetError(f"{what}: expected X, Y or Z; found '{letter}'", code="table.axis.unknown")
     made = correction(errors, functional_point, chain=chain, partial=True)
     k, c = _AXES.index(axis), _AXES.index(component)
     if DOF[c] in made.left:
-        raise DatasetError(f"{DOF[c]} is unknown: {component} cannot be corrected by these errors")
+        raise DatasetError(
+            f"{DOF[c]} is unknown: {component} cannot be corrected by these errors", code="table.freedom.unknown"
+        )
     measured = _measured(errors, axis)
     positions = measured if step is None else _multiples(measured, step)
     fine = np.unique(np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in _pairs(measured, positions)]))
@@ -155,29 +157,41 @@ def axis_table(
 def _measured(errors: xr.Dataset, axis: str) -> Array:
     letter = axis.lower()
     if letter not in errors.variables or errors[letter].dims not in (("position",), ("target",)):
-        raise DatasetError(f"The errors have no positions of {axis}; a table of {axis} requires errors along it")
+        raise DatasetError(
+            f"The errors have no positions of {axis}; a table of {axis} requires errors along it",
+            code="table.axis.no_positions",
+        )
     if errors[letter].dims == ("position",) and str(errors.attrs["component"]) in _AXES.replace(axis, ""):
         raise DatasetError(
-            f"The errors are those of {errors.attrs['component']}; a table of {axis} requires errors along it"
+            f"The errors are those of {errors.attrs['component']}; a table of {axis} requires errors along it",
+            code="table.axis.other",
         )
     found: Array = np.unique(np.round(np.asarray(errors[letter].values, dtype=float), 9))
     found = found[np.isfinite(found)]
     if found.size < 2:
-        raise DatasetError(f"Expected at least two positions of {axis}; found {found.size}")
+        raise DatasetError(
+            f"Expected at least two positions of {axis}; found {found.size}", code="table.positions.too_few"
+        )
     return found
 
 
 def _multiples(measured: Array, step: float) -> Array:
     low, high = measured[0], measured[-1]
     if not (np.isfinite(step) and step > 0):
-        raise DatasetError(f"step: expected a length above 0; found {1e3 * step:g} mm")
+        raise DatasetError(
+            f"step: expected a length above 0; found {1e3 * step:g} mm", code="table.distance.not_positive"
+        )
     first, last = np.ceil(low / step - 1e-6), np.floor(high / step + 1e-6)
     if last - first < 1:
         raise DatasetError(
-            f"step: {1e3 * step:g} mm: fewer than two points from {1e3 * low:g} to {1e3 * high:g} mm; reduce it"
+            f"step: {1e3 * step:g} mm: fewer than two points from {1e3 * low:g} to {1e3 * high:g} mm; reduce it",
+            code="table.distance.too_large",
         )
     if last - first >= MAX_POINTS:
-        raise DatasetError(f"step: {1e3 * step:g} mm: {last - first + 1:.0f} points; expected at most {MAX_POINTS}")
+        raise DatasetError(
+            f"step: {1e3 * step:g} mm: {last - first + 1:.0f} points; expected at most {MAX_POINTS}",
+            code="table.points.too_many",
+        )
     return np.asarray(np.arange(first, last + 1) * step)
 
 

@@ -51,12 +51,14 @@ def check(model: ThermalModel, campaign: xr.Dataset) -> Check:
     for name in ("component", "frame"):
         if campaign.attrs.get(name) != model.dataset.attrs[name]:
             raise DatasetError(
-                f"Expected errors of {name} '{model.dataset.attrs[name]}'; found '{campaign.attrs.get(name)}'"
+                f"Expected errors of {name} '{model.dataset.attrs[name]}'; found '{campaign.attrs.get(name)}'",
+                code="model.attribute.differs",
             )
     there, here = (np.asarray(each.attrs["functional_point"], dtype=float) for each in (model.dataset, campaign))
     if not np.allclose(here, there, atol=1e-6):
         raise DatasetError(
-            f"Expected errors at {there.tolist()} m; found {here.tolist()} m. Move the errors with ds.em.at(point)."
+            f"Expected errors at {there.tolist()} m; found {here.tolist()} m. Move the errors with ds.em.at(point).",
+            code="model.point.differs",
         )
     predicted = model.predict(campaign)
     measured = np.column_stack([campaign[name].values for name in DOF])

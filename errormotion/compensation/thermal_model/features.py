@@ -86,7 +86,9 @@ def _column(inputs: Inputs, feature: Feature) -> Array:
     if feature.source not in available:
         names = ", ".join(available) or "none"
         what = "the working parameter" if feature.parameter else "the temperature"
-        raise DatasetError(f"The model requires {what} '{feature.source}'; found {names}.")
+        raise DatasetError(
+            f"The model requires {what} '{feature.source}'; found {names}.", code="model.reading.missing"
+        )
     values: Array = available[feature.source] ** feature.power
     known = np.isfinite(values)
     if not known.any():

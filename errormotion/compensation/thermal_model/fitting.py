@@ -95,7 +95,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     """
     settings = settings or Settings()
     if not campaigns:
-        raise DatasetError("Expected the errors of at least one campaign; found none.")
+        raise DatasetError("Expected the errors of at least one campaign; found none.", code="model.no_campaigns")
     _check_size(campaigns)
     _check_alike(campaigns)
     records = [read_record(ds, f"campaign {number + 1}") for number, ds in enumerate(campaigns)]
@@ -103,7 +103,8 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     if not seen:
         raise DatasetError(
             f"Expected at least {MIN_SAMPLES} known values of an error in all campaigns together, of two campaigns if "
-            "there are several; found no such error."
+            "there are several; found no such error.",
+            code="model.values.too_few",
         )
     columns = training.Columns(records)
     best, tried = _chosen(columns, seen, settings)
@@ -121,12 +122,15 @@ def _is_known(values: Sequence[int]) -> bool:
 def _check_size(campaigns: Sequence[xr.Dataset]) -> None:
     sensors = max(ds.sizes.get("sensor", 0) for ds in campaigns)
     if sensors > MAX_SENSORS:
-        raise DatasetError(f"Expected at most {MAX_SENSORS} temperature sensors; found {sensors}.")
+        raise DatasetError(
+            f"Expected at most {MAX_SENSORS} temperature sensors; found {sensors}.", code="model.sensors.too_many"
+        )
     values = sum(ds.sizes.get("time", 0) * max(1, ds.sizes.get("sensor", 0)) for ds in campaigns)
     if values > MAX_VALUES:
         raise DatasetError(
             f"Expected at most {MAX_VALUES} temperatures (times by sensors) in all campaigns together; "
-            f"found {values}. Select every tenth time, or fewer sensors."
+            f"found {values}. Select every tenth time, or fewer sensors.",
+            code="model.values.too_many",
         )
 
 
@@ -135,18 +139,23 @@ def _check_alike(campaigns: Sequence[xr.Dataset]) -> None:
     hashes = [provenance.hash_dataset(ds) for ds in campaigns]
     for number, ds in enumerate(campaigns[1:], start=2):
         if (same := hashes.index(hashes[number - 1]) + 1) < number:
-            raise DatasetError(f"Campaign {number} equals campaign {same}; a validation needs different campaigns.")
+            raise DatasetError(
+                f"Campaign {number} equals campaign {same}; a validation needs different campaigns.",
+                code="model.campaign.same",
+            )
         for name in SAME:
             if ds.attrs.get(name) != first.attrs.get(name):
                 raise DatasetError(
                     f"Campaign {number}: expected {name} '{first.attrs.get(name)}' as in campaign 1; "
-                    f"found '{ds.attrs.get(name)}'"
+                    f"found '{ds.attrs.get(name)}'",
+                    code="model.attribute.differs",
                 )
         here, there = (np.asarray(each.attrs["functional_point"], dtype=float) for each in (ds, first))
         if not np.allclose(here, there, atol=1e-6):
             raise DatasetError(
                 f"Campaign {number}: expected the functional point {there.tolist()} m as in campaign 1; found "
-                f"{here.tolist()} m. Move the errors with ds.em.at(point)."
+                f"{here.tolist()} m. Move the errors with ds.em.at(point).",
+                code="model.point.differs",
             )
 
 
@@ -160,7 +169,8 @@ def _chosen(columns: training.Columns, seen: Sequence[int], settings: Settings) 
         missing = [name for name in settings.sensors if name not in common]
         if missing:
             raise DatasetError(
-                f"sensors: expected sensors of all campaigns ({', '.join(common)}); found {', '.join(missing)}"
+                f"sensors: expected sensors of all campaigns ({', '.join(common)}); found {', '.join(missing)}",
+                code="model.sensors.unknown",
             )
     parameters = tuple(
         name
@@ -178,7 +188,8 @@ def _chosen(columns: training.Columns, seen: Sequence[int], settings: Settings) 
     if not candidates:
         raise DatasetError(
             "Expected a temperature sensor common to all campaigns that shows more than noise, or the spindle speed; "
-            "found neither."
+            "found neither.",
+            code="model.sensors.none",
         )
     return min(candidates, key=lambda candidate: candidate.score), candidates
 

@@ -89,7 +89,7 @@ class ThermalModel:
     def __init__(self, dataset: xr.Dataset) -> None:
         found = violations(dataset)
         if found:
-            raise DatasetError(f"Not a thermal model of schema {SCHEMA}:", found)
+            raise DatasetError(f"Not a thermal model of schema {SCHEMA}:", found, code="schema.violated")
         self.dataset = dataset
 
     @classmethod
@@ -131,7 +131,10 @@ class ThermalModel:
         """
         with reading(Path(path)), load_dataset(path) as dataset:
             if dataset.attrs.get("schema") != SCHEMA:
-                raise DatasetError(f"{path}: expected schema {SCHEMA}; found {dataset.attrs.get('schema', 'none')}")
+                raise DatasetError(
+                    f"{path}: expected schema {SCHEMA}; found {dataset.attrs.get('schema', 'none')}",
+                    code="schema.other",
+                )
             return cls(dataset.load())
 
     def save(self, path: str | Path) -> None:

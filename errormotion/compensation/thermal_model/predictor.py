@@ -46,7 +46,8 @@ class ThermalPredictor:
         if not needed.all():
             raise CompensationError(
                 "The model predicts " + ", ".join(str(d) for d in ds["dof"].values[known]) + "; an offset "
-                "requires EX, EY and EZ, and at another functional point than that of the model the three rotations."
+                "requires EX, EY and EZ, and at another functional point than that of the model the three rotations.",
+                code="model.freedoms.missing",
             )
         self._coefficient = np.where(known[:, None], coefficient, np.nan)
         self._covariance = ds["coefficient_covariance"].values
@@ -84,7 +85,9 @@ class ThermalPredictor:
             ``spindle_speed`` in 1/min and ``feed`` in m/s; NaN or absent: unknown.
         """
         if not time > self._time:
-            raise CompensationError(f"Expected a reading after {self._time:g} s; found {time:g} s.")
+            raise CompensationError(
+                f"Expected a reading after {self._time:g} s; found {time:g} s.", code="model.reading.not_later"
+            )
         self._time = time
         values = {name: self._changed(name, value) for name, value in temperature.items()}
         speeds = {name: parameter[name] * factor for name, factor in PARAMETERS.items() if name in parameter}

@@ -68,20 +68,31 @@ def read_inputs(ds: xr.Dataset, what: str = "the data") -> Inputs:
         No time, more than `MAX_TIMES`, no temperature, or times that do not increase.
     """
     if "time" not in ds.dims or "time" not in ds.coords:
-        raise DatasetError(f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}")
+        raise DatasetError(
+            f"{what}: expected temperatures over time; found the dims {', '.join(map(str, ds.dims))}",
+            code="model.temperatures.dims",
+        )
     if ds.sizes["time"] > MAX_TIMES:
-        raise DatasetError(f"{what}: expected at most {MAX_TIMES} times; found {ds.sizes['time']}. Select fewer first.")
+        raise DatasetError(
+            f"{what}: expected at most {MAX_TIMES} times; found {ds.sizes['time']}. Select fewer first.",
+            code="model.times.too_many",
+        )
     if "temperature" not in ds or set(ds["temperature"].dims) != {"time", "sensor"}:
-        raise DatasetError(f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.")
+        raise DatasetError(
+            f"{what}: expected temperature(time, sensor); found none. Add a thermometer to the bench.",
+            code="model.temperatures.missing",
+        )
     time = np.asarray(ds["time"].values, dtype=float)
     if not time.size:
-        raise DatasetError(f"{what}: expected at least one time; found none")
+        raise DatasetError(f"{what}: expected at least one time; found none", code="model.times.none")
     if time.size > 1 and not (np.diff(time) > 0).all():
-        raise DatasetError(f"{what}: expected increasing times")
+        raise DatasetError(f"{what}: expected increasing times", code="model.times.not_increasing")
     values = np.asarray(ds["temperature"].transpose("time", "sensor").values, dtype=float)
     names = [str(name) for name in ds["sensor"].values]
     if len(set(names)) < len(names):
-        raise DatasetError(f"{what}: expected different names of the sensors; found {', '.join(names)}")
+        raise DatasetError(
+            f"{what}: expected different names of the sensors; found {', '.join(names)}", code="model.sensors.names"
+        )
     temperature = {name: since_start(values[:, k]) for k, name in enumerate(names)}
     parameter = {
         name: np.asarray(ds[name].values, dtype=float) * factor
@@ -108,7 +119,10 @@ def read_record(ds: xr.Dataset, what: str = "the errors") -> Record:
     inputs = read_inputs(ds, what)
     if ds["EX"].dims != ("time",):
         dims = ", ".join(map(str, ds["EX"].dims))
-        raise DatasetError(f"{what}: expected errors over time alone; found ({dims}). Select one position first.")
+        raise DatasetError(
+            f"{what}: expected errors over time alone; found ({dims}). Select one position first.",
+            code="model.errors.dims",
+        )
     errors = np.column_stack([np.asarray(ds[name].values, dtype=float) for name in DOF])
     covariance = ds["covariance"].transpose("time", "dof", "dof_").values
     variance = np.diagonal(covariance, axis1=1, axis2=2).copy()
@@ -120,9 +134,11 @@ def _stated(ds: xr.Dataset, name: str, kind: type[Any]) -> Any:
     try:
         found = parse_json(str(ds.attrs[name])) if name in ds.attrs else kind()
     except ValueError as error:
-        raise DatasetError(f"attribute '{name}': expected JSON; {error}") from None
+        raise DatasetError(f"attribute '{name}': expected JSON; {error}", code="model.attribute.form") from None
     if not isinstance(found, kind):
-        raise DatasetError(f"attribute '{name}': expected a JSON {kind.__name__}; found {found!r:.100}")
+        raise DatasetError(
+            f"attribute '{name}': expected a JSON {kind.__name__}; found {found!r:.100}", code="model.attribute.form"
+        )
     return found
 
 

@@ -161,7 +161,9 @@ def _minutes(text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise DatasetError(f"reference: expected a time in min, such as 10; found {text[:40]!r}")
+        raise DatasetError(
+            f"reference: expected a time in min, such as 10; found {text[:40]!r}", code="request.time.form"
+        )
     return value
 
 

@@ -22,7 +22,7 @@ from errormotion.dashboard.lab import Lab, NotFoundError
 from errormotion.dashboard.load import REFUSAL_DELAY, Load, Share
 from errormotion.dashboard.planning import Planner
 from errormotion.dashboard.watch import Watch
-from errormotion.errors import ErrormotionError
+from errormotion.errors import ErrormotionError, code_of
 from errormotion.report.text import signs
 from errormotion.tolerances.decision import INSIDE, OUTSIDE, decision_of
 
@@ -43,6 +43,14 @@ MAX_QUEUED = 64
 """Number of requests that wait for a thread of one kind."""
 MAX_MESSAGE = 2000
 """Longest message on a page, characters."""
+CODES = {
+    400: "request.form",
+    403: "request.forbidden",
+    404: "request.not_found",
+    408: "request.timeout",
+    503: "request.too_many",
+}
+"""Codes of the HTTP status in JSON answers."""
 
 log = logging.getLogger(__name__)
 
@@ -257,7 +265,11 @@ class Guarded(RequestHandler):
         elif wants_page:
             self.finish(self._page("error.html.j2", message=message[:MAX_MESSAGE]))
         else:
-            self.finish({"error": message[:MAX_MESSAGE]})
+            code = code_of(
+                error,
+                CODES.get(self.get_status(), "request.refused") if isinstance(error, HTTPError) else "error.internal",
+            )
+            self.finish({"error": message[:MAX_MESSAGE], "code": code})
 
     def log_exception(self, kind: Any, value: BaseException | None, trace: Any) -> None:
         """Log unexpected errors with their traceback; never a query, a header or a body."""

@@ -204,14 +204,17 @@ def millimetres(text: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) <= MAX_COORDINATE:
-        raise DatasetError(f"functional point: expected three numbers in mm, as in 0, 0, -150; found {text[:40]!r}")
+        raise DatasetError(
+            f"functional point: expected three numbers in mm, as in 0, 0, -150; found {text[:40]!r}",
+            code="request.point.form",
+        )
     return value
 
 
 def _whole(text: str, low: int, high: int) -> int:
     if text.isascii() and text.isdigit() and len(text) <= 9 and low <= int(text) <= high:
         return int(text)
-    raise DatasetError(f"expected a whole number from {low} to {high}; found {text[:40]!r}")
+    raise DatasetError(f"expected a whole number from {low} to {high}; found {text[:40]!r}", code="request.number.form")
 
 
 def _safe(text: str) -> str:

@@ -46,7 +46,7 @@ class Calibration:
     def __init__(self, dataset: xr.Dataset) -> None:
         found = self.violations(dataset)
         if found:
-            raise DatasetError(f"The {self.what} breaks its schema ({self.schema}):", found)
+            raise DatasetError(f"The {self.what} breaks its schema ({self.schema}):", found, code="schema.violated")
         self.dataset = dataset.load()
         self.coefficients = self._values("coefficient")
         self.coefficient_covariance = self._values("coefficient_covariance")
@@ -74,11 +74,18 @@ class Calibration:
             schema = str(dataset.attrs.get("schema", "none"))
             if schema != cls.schema:
                 hint = next((text.format(path) for start, text in cls.hints.items() if schema.startswith(start)), "")
-                raise DatasetError(f"{path}: expected a {cls.what} ({cls.schema}); found schema {schema}{hint}")
+                raise DatasetError(
+                    f"{path}: expected a {cls.what} ({cls.schema}); found schema {schema}{hint}",
+                    code="schema.other",
+                )
             try:
                 return cls(dataset.load().assign_attrs({"name": Path(path).stem} if cls.named else {}))
             except DatasetError as error:
-                raise DatasetError(f"{path}: the {cls.what} breaks its schema ({schema}):", error.violations) from error
+                raise DatasetError(
+                    f"{path}: the {cls.what} breaks its schema ({schema}):",
+                    error.violations,
+                    code="schema.violated",
+                ) from error
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the calibration to a NetCDF file; after an error no file remains."""

@@ -187,7 +187,8 @@ class InclinationCalibration(Calibration):
         known = f" Calibrations there: {', '.join(there)}." if there else ""
         raise DatasetError(
             f"calibration '{name}': not found. Searched: {', '.join(map(str, places))}.{known} Give a path, or copy "
-            f"the file to one of these folders; {VARIABLE} names one more folder"
+            f"the file to one of these folders; {VARIABLE} names one more folder",
+            code="calibration.not_found",
         )
 
     def require_sensor(self, serial_number: str, mid_range: float, *, allow_other_sensor: bool = False) -> list[str]:
@@ -283,7 +284,8 @@ class InclinationCalibration(Calibration):
         raise MethodError(
             f"Calibration '{self.name}': {tilt_text(first)} is {where}{many}; nearest calibrated: {near}. "
             "Calibrate there, measure within the calibrated settings, or allow extrapolation (extrapolate = true in "
-            "the test's settings): the uncertainty then increases with the distance."
+            "the test's settings): the uncertainty then increases with the distance.",
+            code="calibration.inclination.outside",
         )
 
     def compensate(
@@ -333,7 +335,8 @@ class InclinationCalibration(Calibration):
                 f"Calibration '{self.name}': a reading {1e3 * worst:.3f} mm from mid-range is beyond the calibrated "
                 f"{1e3 * low:.3f} to {1e3 * high:.3f} mm ({wrong.size} of {depth.size} readings). Check the mid-range "
                 "of the sensor, measure within the calibrated range, or allow extrapolation (extrapolate = true in the "
-                "test's settings)."
+                "test's settings).",
+                code="calibration.reading.outside",
             )
 
 

@@ -78,7 +78,8 @@ def compare(
     if differences and not allow_other_sensor:
         raise DatasetError(
             f"Calibration '{calibration}': {'; '.join(differences)}. Use the calibration of this sensor, or set "
-            "allow_other_sensor = true."
+            "allow_other_sensor = true.",
+            code="calibration.sensor.other",
         )
     notes = [
         f"Calibration '{calibration}' of another sensor is used (allow_other_sensor): {each}." for each in differences

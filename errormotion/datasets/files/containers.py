@@ -69,7 +69,9 @@ def check_netcdf(path: Path) -> None:
     with h5py.File(path) as file:
         file.attrs.get("_nc3_strict")  # h5netcdf leaves an incomplete object if this fails
         if len(file) > MAX_VARIABLES:
-            raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} variables; found {len(file)}")
+            raise DatasetError(
+                f"{path}: expected at most {MAX_VARIABLES} variables; found {len(file)}", code="file.variables.too_many"
+            )
         found, total, variables = [], 0, {}
         for name in file:
             link = file.get(name, getlink=True)
@@ -116,7 +118,9 @@ def check_classic(path: Path) -> None:
                 math.prod(each.data.shape) * max(DECODED, each.data.dtype.itemsize) for each in file.variables.values()
             )
     if count > MAX_VARIABLES:
-        raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} variables; found {count}")
+        raise DatasetError(
+            f"{path}: expected at most {MAX_VARIABLES} variables; found {count}", code="file.variables.too_many"
+        )
     _raise(path, [], total, path.stat().st_size)
 
 
@@ -146,26 +150,39 @@ def check_zarr(path: Path) -> None:
         The folder cannot be read, or its metadata are not JSON.
     """
     if not (path / "zarr.json").exists():
-        raise DatasetError(f"{path}: expected a Zarr folder of format 3 (zarr.json); found another format")
+        raise DatasetError(
+            f"{path}: expected a Zarr folder of format 3 (zarr.json); found another format", code="zarr.format"
+        )
     size = sum(_files(path, path, DEEPEST))
     root = _metadata(path / "zarr.json")
     held = root.get("consolidated_metadata")
     if held is not None and (not isinstance(held, dict) or not isinstance(held.get("metadata"), dict)):
-        raise DatasetError(f"{path}: consolidated_metadata: expected an object with 'metadata'; found another one")
+        raise DatasetError(
+            f"{path}: consolidated_metadata: expected an object with 'metadata'; found another one",
+            code="zarr.metadata.form",
+        )
     arrays: dict[str, Any] = dict(held["metadata"]) if held else {}
     folders = {each.name for each in path.iterdir() if each.is_dir()}
     for name in arrays:
         if name not in folders:
-            raise DatasetError(f"{path}: {name!r:.100}: expected a folder of this name with its array; found none")
+            raise DatasetError(
+                f"{path}: {name!r:.100}: expected a folder of this name with its array; found none",
+                code="zarr.array.missing",
+            )
     for each in sorted(path.iterdir()):
         if each.name in arrays:
             continue  # the root has its metadata; the file in the folder, which a power cut may damage, is not read
         if (each / "zarr.json").exists():
             arrays[each.name] = _metadata(each / "zarr.json")
         elif each.is_dir():
-            raise DatasetError(f"{path}: {each.name!r:.100}: expected an array (zarr.json); found a folder without it")
+            raise DatasetError(
+                f"{path}: {each.name!r:.100}: expected an array (zarr.json); found a folder without it",
+                code="zarr.array.missing",
+            )
     if len(arrays) > MAX_VARIABLES:
-        raise DatasetError(f"{path}: expected at most {MAX_VARIABLES} arrays; found {len(arrays)}")
+        raise DatasetError(
+            f"{path}: expected at most {MAX_VARIABLES} arrays; found {len(arrays)}", code="file.variables.too_many"
+        )
     found, total = [], 0
     for name, metadata in arrays.items():
         if isinstance(metadata, dict) and metadata.get("node_type") == "group":
@@ -201,13 +218,15 @@ def _raise(path: Path, found: list[str], total: int, size: int) -> None:
             f"expected at most {_most(size)} bytes of values in a file or folder of {size} bytes; it states {total}"
         )
     if found:
-        raise DatasetError(f"{path}: is damaged, or malicious:", found)
+        raise DatasetError(f"{path}: is damaged, or malicious:", found, code="file.malicious")
 
 
 def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
     """Yield the sizes of the files of a store; links, pipes and devices are refused."""
     if depth == 0:
-        raise DatasetError(f"{store}: expected at most {DEEPEST} levels of folders; found more")
+        raise DatasetError(
+            f"{store}: expected at most {DEEPEST} levels of folders; found more", code="zarr.folders.too_deep"
+        )
     with os.scandir(folder) as inside:
         for each in inside:
             if each.is_dir(follow_symlinks=False):
@@ -215,14 +234,17 @@ def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
                 continue
             state = each.stat(follow_symlinks=False)
             if not stat.S_ISREG(state.st_mode):
-                raise DatasetError(f"{each.path}: expected a file in this folder; found a link, a pipe or a device")
+                raise DatasetError(
+                    f"{each.path}: expected a file in this folder; found a link, a pipe or a device",
+                    code="zarr.entry.no_file",
+                )
             yield state.st_size
 
 
 def _metadata(file: Path) -> dict[str, Any]:
     found = parse_json(read_bytes(file, MAX_METADATA))
     if not isinstance(found, dict):
-        raise DatasetError(f"{file}: expected an object; found {type(found).__name__}")
+        raise DatasetError(f"{file}: expected an object; found {type(found).__name__}", code="zarr.metadata.form")
     return found
 
 

@@ -72,10 +72,12 @@ def event(text: str, *, by: str = "", at: datetime | None = None, machine: str =
     if at is not None:
         at = at.replace(tzinfo=UTC) if at.tzinfo is None else at.astimezone(UTC)
         if at > now + CLOCK_ERROR:
-            raise RunError(f"time of the event: expected a time in the past; found {_iso(at)}")
+            raise RunError(
+                f"time of the event: expected a time in the past; found {_iso(at)}", code="event.time.future"
+            )
         made = Event(made.text, made.noted, _iso(at), made.by, made.machine)
     if wrong := _mistake(asdict(made)):
-        raise RunError(wrong)
+        raise RunError(wrong, code="event.text.form")
     return made
 
 
@@ -94,7 +96,10 @@ def append(folder: Path, made: Event) -> Path:
         with open(open_to_append(file), "ab+") as stream, _locked(stream):
             size = stream.seek(0, os.SEEK_END)
             if size + len(data) + 1 > MAX_FILE:
-                raise RunError(f"{file}: the note does not fit: {size} of at most {MAX_FILE} bytes are used")
+                raise RunError(
+                    f"{file}: the note does not fit: {size} of at most {MAX_FILE} bytes are used",
+                    code="event.file.full",
+                )
             if size:
                 stream.seek(-1, os.SEEK_END)
                 if stream.read(1) != b"\n":  # an incomplete line
@@ -105,7 +110,7 @@ def append(folder: Path, made: Event) -> Path:
         if not size:
             sync(folder)  # the name of a new file
     except OSError as error:
-        raise RunError(f"{file}: the note cannot be written: {error.strerror}") from error
+        raise RunError(f"{file}: the note cannot be written: {error.strerror}", code="event.file.unwritable") from error
     return file
 
 

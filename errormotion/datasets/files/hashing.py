@@ -90,7 +90,9 @@ def hash_dataset(ds: xr.Dataset, form: str = "blake3-tree") -> str:
     if form == "sha256":
         return _first_form(ds)
     if form not in _FORMS:
-        raise DatasetError(f"The form of hash '{form}' is unknown; expected one of {', '.join(_FORMS)}")
+        raise DatasetError(
+            f"The form of hash '{form}' is unknown; expected one of {', '.join(_FORMS)}", code="hash.form.unknown"
+        )
     with DatasetHasher(ds, form) as hasher:
         return hasher.value()
 

@@ -98,7 +98,7 @@ class State(dict[str, Any]):
     file: Path = Path(FILE)
 
     def __missing__(self, key: str) -> Any:
-        raise RunError(f"{self.file}: expected the key '{key}'; found none")
+        raise RunError(f"{self.file}: expected the key '{key}'; found none", code="run.file.key.missing")
 
 
 def read_run(folder: Path) -> State:
@@ -114,18 +114,21 @@ def read_run(folder: Path) -> State:
     try:
         found = parse_json(read_bytes(file, MAX_FILE))
     except OSError as error:
-        raise RunError(f"{folder}: expected a run folder with a {FILE}; {error.strerror}") from error
+        raise RunError(
+            f"{folder}: expected a run folder with a {FILE}; {error.strerror}", code="run.folder.not_found"
+        ) from error
     except ValueError as error:
         raise RunError(
             f"{file}: is not valid JSON ({error}); restore it from a copy, "
-            "or identify raw.zarr with 'errormotion identify'"
+            "or identify raw.zarr with 'errormotion identify'",
+            code="run.file.no_json",
         ) from error
     if not isinstance(found, dict) or found.get("schema") != SCHEMA:
         what = found.get("schema") if isinstance(found, dict) else type(found).__name__
-        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {what!r:.100}")
+        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {what!r:.100}", code="run.file.schema")
     mistakes = tomlfile.check(found, _Run, edge=False)[1]
     if mistakes:
-        raise RunError(tomlfile.report(file, mistakes))
+        raise RunError(tomlfile.report(file, mistakes), code="run.file.mistakes")
     return _stated(found, file)
 
 

@@ -74,7 +74,7 @@ def load_model(path: str | Path, model: type[Model], *, error: type[ErrormotionE
     """
     found, mistakes = check(read_toml(path, error=error), model)
     if found is None:
-        raise error(report(path, mistakes))
+        raise error(report(path, mistakes), code="toml.mistakes")
     return found
 
 
@@ -89,13 +89,16 @@ def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError)
     try:
         raw = read_bytes(path, MAX_FILE)
     except OSError as reason:
-        raise error(f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.") from reason
+        raise error(
+            f"{path}: cannot be read: {reason.strerror}. Expected a TOML file there.", code="toml.unreadable"
+        ) from reason
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as reason:
         line = raw.count(b"\n", 0, reason.start) + 1
         raise error(
-            f"{path}, line {line}: byte 0x{raw[reason.start]:02x} is not UTF-8. Save the file as UTF-8."
+            f"{path}, line {line}: byte 0x{raw[reason.start]:02x} is not UTF-8. Save the file as UTF-8.",
+            code="toml.encoding",
         ) from reason
     return parse_toml(text, path, error=error)
 
@@ -109,23 +112,27 @@ def parse_toml(text: str, path: str | Path, *, error: type[ErrormotionError] = D
         Of the type ``error``: not TOML, nested too deeply, or with a number of too many digits.
     """
     if _DOTTED.search(text):  # time and memory of tomllib increase with the square of the number of parts
-        raise error(f"{path}: expected keys of at most {DEEPEST} parts; found more")
+        raise error(f"{path}: expected keys of at most {DEEPEST} parts; found more", code="toml.too_deep")
     deep = f"{path}: expected at most {DEEPEST} levels of arrays and tables; found more"
     try:
         content = tomllib.loads(text)
     except RecursionError:
-        raise error(deep) from None
+        raise error(deep, code="toml.too_deep") from None
     except tomllib.TOMLDecodeError as reason:
         place = re.search(r"(.*) \(at line (\d+), column (\d+)\)$", str(reason), re.DOTALL)
         if place:
-            raise error(f"{path}, line {place[2]}, column {place[3]}: not TOML: {place[1]}") from reason
+            raise error(
+                f"{path}, line {place[2]}, column {place[3]}: not TOML: {place[1]}", code="toml.syntax"
+            ) from reason
         lines = text.splitlines() or [""]
         complaint = str(reason).removesuffix(" (at end of document)")
-        raise error(f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}") from reason
+        raise error(
+            f"{path}, line {len(lines)}, column {len(lines[-1]) + 1}: not TOML: {complaint}", code="toml.syntax"
+        ) from reason
     except ValueError as reason:  # a number of too many digits, an invalid date
-        raise error(f"{path}: not TOML: {reason}") from reason
+        raise error(f"{path}: not TOML: {reason}", code="toml.syntax") from reason
     if _is_deep(content):
-        raise error(deep)
+        raise error(deep, code="toml.too_deep")
     return content
 
 

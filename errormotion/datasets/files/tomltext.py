@@ -99,7 +99,7 @@ def without_table(text: str, name: str, number: int) -> str:
     """
     expected = _read(text)
     if not isinstance(expected.get(name), list):
-        raise DatasetError(f"{name}: the text contains no such tables")
+        raise DatasetError(f"{name}: the text contains no such tables", code="toml.edit.no_tables")
     _put(expected, (name, number), None)
     if not expected[name]:
         del expected[name]
@@ -116,7 +116,7 @@ def without_table(text: str, name: str, number: int) -> str:
 
 def _read(text: str) -> dict[str, Any]:
     if len(text) > MAX_TEXT:
-        raise DatasetError(f"expected at most {MAX_TEXT} characters; found {len(text)}")
+        raise DatasetError(f"expected at most {MAX_TEXT} characters; found {len(text)}", code="toml.too_long")
     return parse_toml(text, "text")
 
 
@@ -124,7 +124,10 @@ def _same(changed: str, expected: Any, place: Sequence[Key]) -> str:
     with suppress(DatasetError):
         if parse_toml(changed, "text") == expected:
             return changed
-    raise DatasetError(f"{dotted(place)}: is written in a form that cannot be changed alone; change it in the text")
+    raise DatasetError(
+        f"{dotted(place)}: is written in a form that cannot be changed alone; change it in the text",
+        code="toml.edit.form",
+    )
 
 
 @dataclass(frozen=True)
@@ -242,4 +245,4 @@ def _put(content: Any, place: Sequence[Key], new: Any) -> None:
         else:
             content[last] = new
     except (KeyError, IndexError, TypeError, AttributeError):
-        raise DatasetError(f"{dotted(place)}: the text contains no such key") from None
+        raise DatasetError(f"{dotted(place)}: the text contains no such key", code="toml.edit.no_key") from None

@@ -60,7 +60,9 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         # On a full disk HDF5 raises a RuntimeError with the message of the system.
-        raise DatasetError(f"{path}: cannot be written: {reason(error, 'there is no such folder')}") from error
+        raise DatasetError(
+            f"{path}: cannot be written: {reason(error, 'there is no such folder')}", code="file.unwritable"
+        ) from error
 
 
 @contextmanager

@@ -57,7 +57,8 @@ def _no_errors(ds: xr.Dataset, asked: str) -> DatasetError:
     schema = ds.attrs.get("schema")
     hint = ". Identify a raw dataset first" if str(schema).startswith("errormotion.raw.") or schema is None else ""
     return DatasetError(
-        f"{asked} belongs to error datasets (attribute schema = '{SCHEMA}'); found schema = {schema!r}{hint}"
+        f"{asked} belongs to error datasets (attribute schema = '{SCHEMA}'); found schema = {schema!r}{hint}",
+        code="schema.other",
     )
 
 
@@ -169,7 +170,8 @@ class ErrorMotion:
         if self._ds.attrs.get("component") == "beam":
             raise DatasetError(
                 "The errors of beams are stated about each beam's own zero point and have no common functional point. "
-                "A beam's origin and direction are in the dataset."
+                "A beam's origin and direction are in the dataset.",
+                code="errors.point.of_beams",
             )
         shift = target - _point(self._ds.attrs["functional_point"])
         self._check_levers(shift)
@@ -198,7 +200,8 @@ class ErrorMotion:
         if "lever_axes" in self._ds.attrs and pose.rotation.magnitude() > 1e-9:
             raise DatasetError(
                 "The errors are not those of one rigid motion (attribute lever_axes): they are known along the axes "
-                "only, and cannot be rotated into another frame"
+                "only, and cannot be rotated into another frame",
+                code="errors.frame.not_rigid",
             )
         ds = self._transformed(twists.adjoint(rotation=pose.rotation))
         present = [axis for axis in "xyz" if axis in ds.variables]
@@ -210,7 +213,8 @@ class ErrorMotion:
         elif present:
             raise DatasetError(
                 f"A change of frame needs the commanded x, y and z together; found {', '.join(present)} alone. "
-                "Add the others as coordinates, or drop them"
+                "Add the others as coordinates, or drop them",
+                code="errors.frame.coordinates",
             )
         return ds.assign_attrs(functional_point=pose.apply(_point(ds.attrs["functional_point"])), frame=name)
 
@@ -263,10 +267,15 @@ class ErrorMotion:
             No such dim, or weights that do not fit.
         """
         if dim not in self.dims:
-            raise DatasetError(f"Expected one of the dims {', '.join(self.dims) or '(none)'}; found '{dim}'")
+            raise DatasetError(
+                f"Expected one of the dims {', '.join(self.dims) or '(none)'}; found '{dim}'", code="errors.dim.unknown"
+            )
         w = np.asarray(weights, dtype=float)
         if w.shape != (self._ds.sizes[dim],) or not np.isfinite(w).all():
-            raise DatasetError(f"Expected {self._ds.sizes[dim]} finite weights along '{dim}'; found shape {w.shape}")
+            raise DatasetError(
+                f"Expected {self._ds.sizes[dim]} finite weights along '{dim}'; found shape {w.shape}",
+                code="errors.weights.shape",
+            )
         axis = self.dims.index(dim)
         used = np.flatnonzero(w)
         w = w[used]
@@ -353,7 +362,10 @@ class ErrorMotion:
 
         own = [name for name in "xyz" if name in self._ds.variables and self._ds[name].dims == ("position",)]
         if not coordinate and len(own) != 1:
-            raise DatasetError(f"Expected one coordinate along 'position'; found {', '.join(own) or 'none'}: state one")
+            raise DatasetError(
+                f"Expected one coordinate along 'position'; found {', '.join(own) or 'none'}: state one",
+                code="errors.coordinate.ambiguous",
+            )
         return to_points(self._ds, "position", coordinate or own[0], positions)
 
     def mean(self, dim: str) -> xr.Dataset:
@@ -425,7 +437,8 @@ class ErrorMotion:
             raise DatasetError(
                 "The errors are not those of one rigid motion (attribute lever_axes): only the travel of "
                 f"{' and '.join(levers)} is a lever of their rotations, and they cannot be moved along "
-                f"{' and '.join(wrong)}. Identify them at the other functional point"
+                f"{' and '.join(wrong)}. Identify them at the other functional point",
+                code="errors.point.not_rigid",
             )
 
     def _stacked(self, names: Sequence[str]) -> Array:
@@ -461,15 +474,20 @@ class ErrorMotion:
     def _index(self, place: int | Sequence[int] | Mapping[str, int]) -> tuple[int, ...]:
         if isinstance(place, Mapping):
             if set(place) != set(self.dims):
-                raise DatasetError(f"Expected an index for each of {', '.join(self.dims)}; found {dict(place)}")
+                raise DatasetError(
+                    f"Expected an index for each of {', '.join(self.dims)}; found {dict(place)}",
+                    code="errors.index.dims",
+                )
             place = [place[dim] for dim in self.dims]
         index = (int(place),) if isinstance(place, (int, np.integer)) else tuple(int(number) for number in place)
         if len(index) != len(self.dims):
-            raise DatasetError(f"Expected an index for each of {', '.join(self.dims)}; found {index}")
+            raise DatasetError(
+                f"Expected an index for each of {', '.join(self.dims)}; found {index}", code="errors.index.dims"
+            )
         sizes = [self._ds.sizes[dim] for dim in self.dims]
         for number, size in zip(index, sizes, strict=True):
             if not -size <= number < size:
-                raise DatasetError(f"Expected an index below {size}; found {number}")
+                raise DatasetError(f"Expected an index below {size}; found {number}", code="errors.index.outside")
         return tuple(number % size for number, size in zip(index, sizes, strict=True))
 
     def _transformed(self, A: Array) -> xr.Dataset:
@@ -488,5 +506,7 @@ class ErrorMotion:
 def _point(point: ArrayLike) -> Array:
     array = np.array(point, dtype=float)
     if array.shape != (3,) or not np.isfinite(array).all():
-        raise DatasetError(f"Expected a point: three finite coordinates in m; found {point!r}")
+        raise DatasetError(
+            f"Expected a point: three finite coordinates in m; found {point!r}", code="errors.point.form"
+        )
     return array

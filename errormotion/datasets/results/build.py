@@ -155,7 +155,10 @@ def build_errors(
         more = dict(extras or {})
         clash = sorted(set(more) & {*variables, *own_coords})
         if clash:
-            raise DatasetError(f"extras: expected names that are not used by the schema; found {', '.join(clash)}")
+            raise DatasetError(
+                f"extras: expected names that are not used by the schema; found {', '.join(clash)}",
+                code="errors.extras.name_used",
+            )
         # Arrays without coordinates need no alignment, which would take most of the time.
         bare = {name: each.variable for name, each in more.items() if not len(each.coords)}
         aligned = len(bare) < len(more)
@@ -163,10 +166,14 @@ def build_errors(
         if aligned:
             ds = ds.assign(more | bare)
     except ValueError as error:
-        raise DatasetError(f"Values, coordinates and extra results do not fit together: {error}") from error
+        raise DatasetError(
+            f"Values, coordinates and extra results do not fit together: {error}", code="errors.arrays.shape"
+        ) from error
     found = error_violations(ds)
     if found:
-        raise DatasetError(f"The result of method '{method}' breaks the schema {SCHEMA}:", found)
+        raise DatasetError(
+            f"The result of method '{method}' breaks the schema {SCHEMA}:", found, code="schema.violated"
+        )
     return ds if measured is None else with_doubts(ds, of_result(ds))
 
 
@@ -228,7 +235,9 @@ def build_deviations(
     try:
         arrays = {name: xr.DataArray(array, dims=names, attrs=attrs) for name, (names, array, attrs) in found.items()}
     except ValueError as error:
-        raise DatasetError(f"Deviation, variance, sensitivity and influence do not fit together: {error}") from error
+        raise DatasetError(
+            f"Deviation, variance, sensitivity and influence do not fit together: {error}", code="errors.arrays.shape"
+        ) from error
     unseen = np.full((*value.shape, 6), np.nan)
     return build_errors(
         unseen,
@@ -247,7 +256,7 @@ def _check_shapes(E: Array, C: Array, dims: tuple[str, ...]) -> None:
     elif (*E.shape, 6) != C.shape:
         found.append(f"covariance: expected shape {(*E.shape, 6)}; found {C.shape}")
     if found:
-        raise DatasetError("Arrays do not fit together:", found)
+        raise DatasetError("Arrays do not fit together:", found, code="errors.arrays.shape")
 
 
 def _influence(
@@ -261,9 +270,15 @@ def _influence(
     names = list(sources or ())
     expected = (len(names), *unseen.shape)
     if F.shape != expected:
-        raise DatasetError(f"influence: expected shape {expected} for {len(names)} named sources; found {F.shape}")
+        raise DatasetError(
+            f"influence: expected shape {expected} for {len(names)} named sources; found {F.shape}",
+            code="errors.influence.shape",
+        )
     if groups is None or len(groups) != len(names):
-        raise DatasetError(f"source_groups: expected {len(names)}, one for each source; found {len(groups or ())}")
+        raise DatasetError(
+            f"source_groups: expected {len(names)}, one for each source; found {len(groups or ())}",
+            code="errors.groups.count",
+        )
     variable = (("source", *dims, "dof"), np.where(unseen, np.nan, F), {"long_name": "of one standard uncertainty"})
     return variable, {"source": names, "source_group": ("source", list(groups))}
 
@@ -271,7 +286,10 @@ def _influence(
 def _identities(names: list[str], ids: Mapping[str, str], references: Sequence[str]) -> dict[str, Any]:
     """Return the coordinates with the identities of the sources, and with those of the reference state."""
     if stray := sorted({*ids, *references} - set(names)):
-        raise DatasetError(f"source_ids, reference_sources: expected names among {names}; found {', '.join(stray)}")
+        raise DatasetError(
+            f"source_ids, reference_sources: expected names among {names}; found {', '.join(stray)}",
+            code="errors.sources.unknown",
+        )
     return {
         "source_id": ("source", [ids.get(name, "") for name in names]),
         "source_reference": ("source", np.array([name in references for name in names], dtype=np.int8)),

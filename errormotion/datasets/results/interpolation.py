@@ -55,15 +55,23 @@ def to_points(ds: xr.Dataset, dim: str, coordinate: str, points: ArrayLike) -> x
         No such dimension, errors along one direction only, points that do not increase.
     """
     if "deviation" in ds.variables:
-        raise DatasetError("The errors are known along one direction only; the six freedoms are needed here")
+        raise DatasetError(
+            "The errors are known along one direction only; the six freedoms are needed here",
+            code="errors.freedoms.one_direction",
+        )
     if dim not in ds["EX"].dims or coordinate not in ds.variables or ds[coordinate].dims != (dim,):
-        raise DatasetError(f"Expected errors over '{dim}' with the coordinate '{coordinate}' along it")
+        raise DatasetError(
+            f"Expected errors over '{dim}' with the coordinate '{coordinate}' along it",
+            code="errors.coordinate.missing",
+        )
     new = np.atleast_1d(np.asarray(points, dtype=float))
     t = np.asarray(ds[coordinate].values, dtype=float)
     if new.ndim != 1 or not np.isfinite(new).all() or (np.diff(new) <= 0).any():
-        raise DatasetError(f"{coordinate}: expected finite points that increase")
+        raise DatasetError(f"{coordinate}: expected finite points that increase", code="errors.points.not_increasing")
     if (np.diff(t) <= 0).any():
-        raise DatasetError(f"{coordinate}: expected values that increase along '{dim}'")
+        raise DatasetError(
+            f"{coordinate}: expected values that increase along '{dim}'", code="errors.coordinate.not_increasing"
+        )
     axis = ds["EX"].dims.index(dim)
     E = np.moveaxis(np.stack([ds[name].values for name in DOF], axis=-1), axis, 0)
     F = np.moveaxis(influence_of(ds), axis + 1, 1)

@@ -58,7 +58,9 @@ def since(ds: xr.Dataset, time: float | tuple[float, float]) -> xr.Dataset:
     count = used.sum(axis=0)
     if not (count > 0)[seen.any(axis=-1)].all():
         raise DatasetError(
-            f"No known errors from {first:g} s to {last:g} s for a reference state; times are {t[0]:g} s to {t[-1]:g} s"
+            f"No known errors from {first:g} s to {last:g} s for a reference state; times are "
+            f"{t[0]:g} s to {t[-1]:g} s",
+            code="errors.reference.no_errors",
         )
     changed, total, influence, further = changes(E, C, F, used)
     zero = (first + last) / 2
@@ -168,28 +170,38 @@ def change(after: xr.Dataset, before: xr.Dataset) -> xr.Dataset:
     for name in ("machine", "component", "frame"):
         if after.attrs[name] != before.attrs[name]:
             raise DatasetError(
-                f"A change needs one {name}; found '{after.attrs[name]}' and '{before.attrs[name]}' (before)"
+                f"A change needs one {name}; found '{after.attrs[name]}' and '{before.attrs[name]}' (before)",
+                code="change.attribute.differs",
             )
     dims = after["EX"].dims
     if dims != before["EX"].dims or dims not in (("position",), ("target",)):
         raise DatasetError(
             "A change of places needs errors over position or target in both datasets; found "
-            f"{', '.join(map(str, dims)) or 'none'} and {', '.join(map(str, before['EX'].dims)) or 'none'} (before)"
+            f"{', '.join(map(str, dims)) or 'none'} and {', '.join(map(str, before['EX'].dims)) or 'none'} (before)",
+            code="change.places.dims",
         )
     silent = [name for name, ds in (("after", after), ("before", before)) if not ds.attrs.get("start")]
     if silent:
-        raise DatasetError(f"A change needs the attribute 'start' of both datasets; {' and '.join(silent)}: none")
+        raise DatasetError(
+            f"A change needs the attribute 'start' of both datasets; {' and '.join(silent)}: none",
+            code="change.start.missing",
+        )
     _freedoms_over(after, str(dims[0]))
     _freedoms_over(before, str(dims[0]))
     before = before.em.at(after.attrs["functional_point"])
     axes = [name for name in "xyz" if name in after.variables and name in before.variables]
     places = [np.stack([ds[name].values for name in axes], axis=-1) if axes else None for ds in (after, before)]
     if places[0] is None or places[1] is None:
-        raise DatasetError("A change of places needs the commanded x, y or z in both datasets; found none in common")
+        raise DatasetError(
+            "A change of places needs the commanded x, y or z in both datasets; found none in common",
+            code="change.places.coordinates",
+        )
     nearest = np.array([np.abs(places[1] - each).max(axis=1).argmin() for each in places[0]])
     rows = np.flatnonzero(np.abs(places[0] - places[1][nearest]).max(axis=1) <= SAME_PLACE)
     if not rows.size:
-        raise DatasetError(f"The datasets have no place in common (within {SAME_PLACE * 1e6:g} um)")
+        raise DatasetError(
+            f"The datasets have no place in common (within {SAME_PLACE * 1e6:g} um)", code="change.places.none_common"
+        )
     a, b = after.isel({dims[0]: rows}), before.isel({dims[0]: nearest[rows]})
     F, G = influence_of(a), influence_of(b)
     own = [ds["covariance"].values - np.einsum("snj,snk->njk", f, f) for ds, f in ((a, F), (b, G))]
@@ -292,9 +304,15 @@ def influence_of(ds: xr.Dataset) -> Array:
 
 def _freedoms_over(ds: xr.Dataset, dim: str) -> None:
     if "deviation" in ds.variables:
-        raise DatasetError("The errors are known along one direction only; the six freedoms are needed here")
+        raise DatasetError(
+            "The errors are known along one direction only; the six freedoms are needed here",
+            code="errors.freedoms.one_direction",
+        )
     if dim not in ds["EX"].dims:
-        raise DatasetError(f"Expected errors over '{dim}'; found {', '.join(map(str, ds['EX'].dims)) or 'no dims'}")
+        raise DatasetError(
+            f"Expected errors over '{dim}'; found {', '.join(map(str, ds['EX'].dims)) or 'no dims'}",
+            code="errors.dim.missing",
+        )
 
 
 def _started(ds: xr.Dataset, seconds: float) -> dict[str, str]:

@@ -84,7 +84,10 @@ def chosen(ds: xr.Dataset, freedoms: str | Sequence[str] | None) -> list[str]:
     unknown = [str(name) for name in asked if str(name).upper() not in by_name]
     if unknown or not asked:
         shown = list(own) if list(own) == list(own.values()) else [*own, *own.values()]
-        raise DatasetError(f"Expected freedoms of {', '.join(shown)}; found {', '.join(unknown) or 'none'}")
+        raise DatasetError(
+            f"Expected freedoms of {', '.join(shown)}; found {', '.join(unknown) or 'none'}",
+            code="errors.freedoms.unknown",
+        )
     return list(dict.fromkeys(by_name[str(name).upper()] for name in asked))
 
 

@@ -107,11 +107,13 @@ def save(ds: xr.Dataset, path: str | Path, *, overwrite: bool = False) -> Path:
     """
     path = Path(path)
     if path.suffix not in (*_NETCDF, ".zarr"):
-        raise DatasetError(f"{path}: expected a name that ends in .nc (NetCDF-4 file) or .zarr (Zarr folder)")
+        raise DatasetError(
+            f"{path}: expected a name that ends in .nc (NetCDF-4 file) or .zarr (Zarr folder)", code="file.name.ending"
+        )
     _refuse_existing(path, overwrite)
     unstorable = storable_violations(ds)
     if unstorable:
-        raise DatasetError(f"{path}: cannot be written:", unstorable)
+        raise DatasetError(f"{path}: cannot be written:", unstorable, code="file.content.unstorable")
     with writing(path):
         if path.suffix == ".zarr":
             from errormotion.datasets.storage.folder_store import FolderStore  # loads zarr
@@ -150,24 +152,29 @@ def _engine_of(path: Path) -> str:
             return "zarr"
         inside = sorted(item.name for item in path.iterdir() if item.suffix in (".zarr", ".nc"))
         hint = f" Did you mean {path / inside[0]}?" if inside else ""
-        raise DatasetError(f"{path}: is a folder without zarr.json, not a dataset.{hint}")
+        raise DatasetError(f"{path}: is a folder without zarr.json, not a dataset.{hint}", code="zarr.folder.other")
     try:
         require_regular(path)
         with path.open("rb") as file:
             head = file.read(8)
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {reason(error, 'there is no such file')}") from error
+        raise DatasetError(
+            f"{path}: cannot be read: {reason(error, 'there is no such file')}", code="file.unreadable"
+        ) from error
     if head == _HDF5_SIGNATURE:
         return "h5netcdf"
     if not head:
-        raise DatasetError(f"{path}: is empty; expected a NetCDF-4 file. Writing was interrupted: create it again")
+        raise DatasetError(
+            f"{path}: is empty; expected a NetCDF-4 file. Writing was interrupted: create it again", code="file.empty"
+        )
     if head.startswith(_CLASSIC_SIGNATURES):
         return "scipy"
     if _HDF5_SIGNATURE.startswith(head):
-        raise DatasetError(f"{path}: is truncated; create it again or copy it again")
+        raise DatasetError(f"{path}: is truncated; create it again or copy it again", code="file.truncated")
     raise DatasetError(
         f"{path}: is not a dataset; expected a NetCDF file, a Zarr folder or a .csv file of readings. For a text log "
-        "use 'errormotion import'"
+        "use 'errormotion import'",
+        code="file.kind.unknown",
     )
 
 
@@ -198,13 +205,15 @@ def _reading(path: Path) -> Iterator[None]:
             error.args = (f"{path}: {error}",)
         raise
     except PermissionError as error:
-        raise DatasetError(f"{path}: cannot be read: permission denied") from error
+        raise DatasetError(f"{path}: cannot be read: permission denied", code="file.no_permission") from error
     except MemoryError as error:
-        raise DatasetError(f"{path}: needs more memory than this computer has") from error
+        raise DatasetError(f"{path}: needs more memory than this computer has", code="file.memory") from error
     except Exception as error:
         # Errors of h5py, zarr and xarray for truncated files and other formats.
         what = "is truncated" if "truncated" in str(error) else "is damaged, or not a dataset of errormotion"
-        raise DatasetError(f"{path}: {what}; create it again or copy it again. (Reader: {error})") from error
+        raise DatasetError(
+            f"{path}: {what}; create it again or copy it again. (Reader: {error})", code="file.damaged"
+        ) from error
 
 
 @contextmanager
@@ -217,23 +226,27 @@ def reading(path: str | Path) -> Iterator[None]:
             error.args = (f"{path}: {error}",)
         raise
     except MemoryError as error:
-        raise DatasetError(f"{path}: needs more memory than this computer has") from error
+        raise DatasetError(f"{path}: needs more memory than this computer has", code="file.memory") from error
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        raise DatasetError(f"{path}: its values cannot be evaluated ({type(error).__name__}: {error})") from error
+        raise DatasetError(
+            f"{path}: its values cannot be evaluated ({type(error).__name__}: {error})", code="file.values.unreadable"
+        ) from error
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         if isinstance(error, ValueError) and any(part in frames[-1].filename for part in _NUMERICAL):
-            raise DatasetError(f"{path}: its values cannot be evaluated ({error})") from error
+            raise DatasetError(
+                f"{path}: its values cannot be evaluated ({error})", code="file.values.unreadable"
+            ) from error
         if not any(part in frame.filename for frame in frames for part in _READERS):
             raise
         raise DatasetError(
-            f"{path}: is damaged or incomplete; copy it again, or measure again. (Reader: {error})"
+            f"{path}: is damaged or incomplete; copy it again, or measure again. (Reader: {error})", code="file.damaged"
         ) from error
 
 
 def _refuse_existing(path: Path, overwrite: bool) -> None:
     if not overwrite and (path.exists() or path.is_symlink()):
-        raise DatasetError(f"{path}: already exists; choose another name, or allow overwriting")
+        raise DatasetError(f"{path}: already exists; choose another name, or allow overwriting", code="file.exists")
 
 
 def _tidy(ds: xr.Dataset) -> xr.Dataset:
@@ -256,7 +269,10 @@ def _text(variable: xr.Variable) -> xr.Variable:
     values = [item.decode() if isinstance(item, bytes) else str(item) for item in variable.values.ravel().tolist()]
     needed = WIDTH * len(values) * max(map(len, values), default=0)  # every text has the width of the longest one
     if needed > MUCH:
-        raise DatasetError(f"its texts need {needed} bytes, since all have the width of the longest; at most {MUCH}")
+        raise DatasetError(
+            f"its texts need {needed} bytes, since all have the width of the longest; at most {MUCH}",
+            code="file.texts.too_long",
+        )
     array = np.array(values, dtype=str).reshape(variable.shape)
     return xr.Variable(variable.dims, array, variable.attrs)
 
@@ -283,7 +299,10 @@ def _with_indexes(ds: xr.Dataset) -> xr.Dataset:
     if "time" in ds.sizes and "time" not in ds.variables and isinstance(rate, (int, float)) and rate > 0:
         start, size = float(ds.attrs.get("time_start", 0.0)), ds.sizes["time"]
         if not math.isfinite(start + size / rate) or not 1 / rate > 0:
-            raise DatasetError(f"sample_rate, time_start: expected finite times; found {rate:g} Hz, {start:g} s")
+            raise DatasetError(
+                f"sample_rate, time_start: expected finite times; found {rate:g} Hz, {start:g} s",
+                code="raw.time.not_finite",
+            )
         # Half a step before the end, so that the number of times does not depend on rounding; the step is 1 / rate.
         index = RangeIndex.arange(start, start + (size - 0.5) / rate, 1 / rate, dim="time")
         ds = ds.assign_coords(xr.Coordinates.from_xindex(index))

@@ -108,7 +108,10 @@ def encoded(values: np.ndarray, metadata: Mapping[str, Any]) -> bytes:
         return bytes(blosc.compress(content, stated["cname"].encode(), stated["clevel"], mode, stated["blocksize"]))
     if compressor["name"] == "zstd":
         return bytes(to_zstd(content, stated["level"], stated["checksum"]))
-    raise DatasetError(f"expected a chunk compressed by {' or '.join(_COMPRESSORS)}; found {compressor['name']!r}")
+    raise DatasetError(
+        f"expected a chunk compressed by {' or '.join(_COMPRESSORS)}; found {compressor['name']!r}",
+        code="zarr.compressor.unknown",
+    )
 
 
 def _json(file: Path) -> dict[str, Any]:
@@ -248,11 +251,12 @@ class _Array(BackendArray):
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             target[...] = self._fill  # a chunk of nothing else has no file
         except OSError as error:
-            raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+            raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", code="file.unreadable") from error
         except (RuntimeError, TypeError, ValueError, struct.error) as error:
             raise DatasetError(
                 f"{self._folder.parent}: is damaged or incomplete; copy it again, or measure again. "
-                f"({path.relative_to(self._folder.parent)}: {error})"
+                f"({path.relative_to(self._folder.parent)}: {error})",
+                code="file.damaged",
             ) from error
 
     def _runs_into(self, file: Any, window: Sequence[slice], target: np.ndarray) -> bool:

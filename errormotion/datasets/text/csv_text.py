@@ -55,7 +55,10 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
             match = _KEY.fullmatch(bare)
             if match and match[1] in header:
                 before = header[match[1]][0]
-                raise DatasetError(f"{path}, line {number}: duplicate key '{match[1]}'; first given in line {before}")
+                raise DatasetError(
+                    f"{path}, line {number}: duplicate key '{match[1]}'; first given in line {before}",
+                    code="csv.key.duplicate",
+                )
             if match:
                 header[match[1]] = (number, match[2].strip())
         elif bare:
@@ -64,7 +67,9 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
             parts.append([])
     tables = [_split(path, block) for block in parts if block]
     if not tables:
-        raise DatasetError(f"{path}: expected a line of column names and lines of readings; found none")
+        raise DatasetError(
+            f"{path}: expected a line of column names and lines of readings; found none", code="csv.no_readings"
+        )
     return header, tables
 
 
@@ -72,15 +77,16 @@ def _lines(path: Path) -> list[str]:
     try:
         data = read_bytes(path, MAX_FILE)
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}", code="file.unreadable") from error
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise DatasetError(f"{path}: is UTF-16; expected UTF-8. Save it as 'CSV UTF-8'")
+        raise DatasetError(f"{path}: is UTF-16; expected UTF-8. Save it as 'CSV UTF-8'", code="text.encoding")
     try:
         return data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise DatasetError(
-            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as 'CSV UTF-8'"
+            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as 'CSV UTF-8'",
+            code="text.encoding",
         ) from error
 
 
@@ -92,6 +98,8 @@ def _split(path: Path, block: list[tuple[int, str]]) -> Table:
         try:
             (fields,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True)
         except csv.Error as error:
-            raise DatasetError(f"{path}, line {number}: cannot be split into fields: {error}") from error
+            raise DatasetError(
+                f"{path}, line {number}: cannot be split into fields: {error}", code="csv.fields"
+            ) from error
         rows.append((number, [text.strip() for text in fields]))
     return Table(rows[0], rows[1:])

@@ -104,7 +104,9 @@ def read_columns(
                 value = _number(text, where, form, line, mistakes)
             cells[key].append(value)
     if not lines and not mistakes.count:
-        raise DatasetError(f"{mistakes.path}: expected lines of numbers below the header; found none")
+        raise DatasetError(
+            f"{mistakes.path}: expected lines of numbers below the header; found none", code="log.no_numbers"
+        )
     values = {key: np.array(column, dtype=float) for key, column in cells.items()}
     found = np.array(lines, dtype=np.int64)
     start = clock.start.isoformat() if clock and clock.start else ""
@@ -169,7 +171,7 @@ def columns_of(
     remaining = _rows(mistakes.path, form)
     head = next(remaining, None)
     if head is None:
-        raise DatasetError(f"{mistakes.path}: expected lines of numbers; found none")
+        raise DatasetError(f"{mistakes.path}: expected lines of numbers; found none", code="log.no_numbers")
     places = _places(head[1], head[0], wanted, form, mistakes)
     mistakes.raise_any()
     return head, remaining if form.header else _chain(head, remaining), places
@@ -194,7 +196,8 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
             if marked and not encoding.startswith(("utf-16", "utf-32")):
                 raise DatasetError(
                     f"{log}, line 1: starts with the byte order mark of UTF-16; set format.encoding = 'utf-16' "
-                    "in the map"
+                    "in the map",
+                    code="text.encoding",
                 )
             binary.seek(0)
             if encoding.startswith(("utf-16", "utf-32")):
@@ -208,19 +211,22 @@ def _lines(log: Path, encoding: str) -> Iterator[tuple[int, str]]:
         byte = error.object[error.start]
         raise DatasetError(
             f"{log}, line {max(number, 1)}: byte 0x{byte:02x} is not {encoding}; set format.encoding in the map to "
-            "the encoding of the log, such as 'cp1252'"
+            "the encoding of the log, such as 'cp1252'",
+            code="text.encoding",
         ) from error
     except UnicodeError as error:
-        raise DatasetError(f"{log}, line {number + 1}: is not {encoding}: {error}") from error
+        raise DatasetError(f"{log}, line {number + 1}: is not {encoding}: {error}", code="text.encoding") from error
     except OSError as error:
-        raise DatasetError(f"{log}: cannot be read: {error.strerror}") from error
+        raise DatasetError(f"{log}: cannot be read: {error.strerror}", code="file.unreadable") from error
 
 
 def _bounded(file: IO[AnyStr], log: Path) -> Iterator[tuple[int, AnyStr]]:
     """Yield the lines of a file with their numbers; DatasetError names one that is too long."""
     for number, line in enumerate(iter(partial(file.readline, MAX_LINE + 1), file.read(0)), 1):
         if len(line) > MAX_LINE:
-            raise DatasetError(f"{log}, line {number}: expected at most {MAX_LINE} characters; it is longer")
+            raise DatasetError(
+                f"{log}, line {number}: expected at most {MAX_LINE} characters; it is longer", code="text.line.too_long"
+            )
         yield number, line
 
 
@@ -247,7 +253,7 @@ def _rows(log: Path, form: Format) -> Iterator[tuple[int, list[str]]]:
         for row in reader:
             yield current, row
     except csv.Error as error:
-        raise DatasetError(f"{log}, line {current}: cannot be split into fields: {error}") from error
+        raise DatasetError(f"{log}, line {current}: cannot be split into fields: {error}", code="csv.fields") from error
 
 
 def _chain(first: T, rest: Iterator[T]) -> Iterator[T]:

@@ -71,5 +71,7 @@ class Mistakes:
             number = "1 mistake" if self.count == 1 else f"{self.count} mistakes"
             shown = [text for kind in kinds for text in kind.shown()]
             raise DatasetError(
-                f"{self.path}: {number}; nothing was imported", [*shown, *([f"and {rest} more"] if rest else [])]
+                f"{self.path}: {number}; nothing was imported",
+                [*shown, *([f"and {rest} more"] if rest else [])],
+                code="import.mistakes",
             )

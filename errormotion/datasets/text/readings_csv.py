@@ -76,13 +76,15 @@ def read_csv(path: str | Path) -> xr.Dataset:
         known = ", ".join(sorted({raw.id for raw in raw_schemas()}))
         raise DatasetError(
             f"{path}: expected a line '# schema = ...' that names one of {known}; found none. "
-            "Import logs of other software with 'errormotion import'."
+            "Import logs of other software with 'errormotion import'.",
+            code="csv.schema.missing",
         )
     line, schema = header["schema"]
     known_variants = variants(schema)
     if not known_variants:
         raise DatasetError(
-            f"{path}, line {line}: schema '{schema}' is unknown; {nearest(schema, {raw.id for raw in raw_schemas()})}"
+            f"{path}, line {line}: schema '{schema}' is unknown; {nearest(schema, {raw.id for raw in raw_schemas()})}",
+            code="schema.unknown",
         )
     names, found = Names.of(known_variants), Found()
     for key, (line, text) in header.items():
@@ -98,7 +100,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
     raw = found.dataset(attrs, names)
     broken = violations(raw)
     if broken:
-        raise DatasetError(f"{path}: breaks {schema}:", broken)
+        raise DatasetError(f"{path}: breaks {schema}:", broken, code="schema.violated")
     return raw
 
 

@@ -152,7 +152,10 @@ def autoregressive(problem: Problem, order: Array, phi: float, series: Index | N
         Readings of one series with the same order; a noise by ``root``.
     """
     if problem.noise.sd is None:
-        raise FitError("correlated noise: expected standard deviations of the readings (sd); found a root")
+        raise FitError(
+            "correlated noise: expected standard deviations of the readings (sd); found a root",
+            code="estimation.noise.root",
+        )
     chain = _Chain.of(problem, order, series)
     y = column(problem.readings)
     n, r = y.shape
@@ -249,7 +252,9 @@ def with_trend(
     mean = np.bincount(which[used], weights=order[used], minlength=count.size) / count
     extent = float(np.ptp(order[used])) if used.any() else 0.0
     if not extent > 0:
-        raise FitError("expected readings at several instants for a trend; found one")
+        raise FitError(
+            "expected readings at several instants for a trend; found one", code="estimation.trend.one_instant"
+        )
     m = column(problem.equation(problem.y, *_rows(problem))).shape[1]
     design = ((order - mean[which]) / extent)[:, None, None] * np.eye(m)
     return with_linear(problem, name, design, index=which, group=group)
@@ -346,7 +351,10 @@ class _Chain:
         steps = np.asarray(order, dtype=float)[late] - np.asarray(order, dtype=float)[early]
         if steps.size:
             if steps.min() <= 0:
-                raise FitError("expected different orders within a series; state the series of simultaneous readings")
+                raise FitError(
+                    "expected different orders within a series; state the series of simultaneous readings",
+                    code="estimation.series.order",
+                )
             distance[late] = steps / np.median(steps)
         return cls(before, np.asarray(before == np.arange(n)), used, after, distance)
 

@@ -249,7 +249,8 @@ class _Search:
             found = better
         raise FitError(
             f"more than {MAX_PASSES} searches for outliers among {self.what} have found more of them; check units, "
-            "the order of the readings and their stated noise"
+            "the order of the readings and their stated noise",
+            code="estimation.outliers.too_many",
         )
 
     def fitted(self, problem: Problem, before: Fit | None = None) -> Fit:

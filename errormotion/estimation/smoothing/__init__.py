@@ -144,14 +144,17 @@ def smooth(
     y, v = y.reshape(prod(batch), n), v.reshape(prod(batch), n)
     known = np.isfinite(y) & np.isfinite(v)
     if (v[known] <= 0).any():
-        raise MethodError("Expected variances above 0 of all points; leave out what is exact (the cold cycle).")
+        raise MethodError(
+            "Expected variances above 0 of all points; leave out what is exact (the cold cycle).",
+            code="smoothing.variance.not_positive",
+        )
     _, place = np.unique(x, return_inverse=True)
     at_place = place[:, None] == np.arange(place.max(initial=-1) + 1)
     different = (known @ at_place).sum(axis=1) + int(exact_zero)
     if order is None:
         order = int(np.clip(different.max(initial=0) - 1, 1, ORDER))
     if order not in (1, 2, 3):
-        raise MethodError(f"Expected order 1, 2 or 3 of the curves; found {order}.")
+        raise MethodError(f"Expected order 1, 2 or 3 of the curves; found {order}.", code="smoothing.order")
     rows = np.flatnonzero(different >= order)
     orders = (order, order - 1) if rougher and order > 1 else (order,)
 
@@ -223,7 +226,10 @@ def smooth_vectors(
     """
     y, C = np.asarray(values, dtype=float), np.asarray(covariance, dtype=float)
     if y.ndim < 2 or C.shape != (*y.shape, y.shape[-1]):
-        raise MethodError(f"Expected values (..., n, d) and covariance (..., n, d, d); found {y.shape}, {C.shape}.")
+        raise MethodError(
+            f"Expected values (..., n, d) and covariance (..., n, d, d); found {y.shape}, {C.shape}.",
+            code="smoothing.shape",
+        )
     d = y.shape[-1]
     v = np.diagonal(C, axis1=-2, axis2=-1)
     known = np.isfinite(y) & np.isfinite(v)
@@ -254,9 +260,15 @@ def _check(x: Array, y: Array, v: Array, to: Array, exact_zero: bool) -> None:
     if x.ndim != 1 or to.ndim != 1 or y.shape[-1:] != x.shape or v.shape != y.shape:
         raise MethodError(
             "Expected positions (n,), values and variance (..., n), and requested positions (m,); found "
-            f"{x.shape}, {y.shape}, {v.shape} and {to.shape}."
+            f"{x.shape}, {y.shape}, {v.shape} and {to.shape}.",
+            code="smoothing.shape",
         )
     if not (np.isfinite(x).all() and np.isfinite(to).all()):
-        raise MethodError("Expected finite positions; a missing point has the value NaN.")
+        raise MethodError(
+            "Expected finite positions; a missing point has the value NaN.", code="smoothing.position.not_finite"
+        )
     if exact_zero and (x <= 0).any():
-        raise MethodError(f"Expected positions above 0 for curves that start at position 0; found {x.min():g}.")
+        raise MethodError(
+            f"Expected positions above 0 for curves that start at position 0; found {x.min():g}.",
+            code="smoothing.position.not_positive",
+        )

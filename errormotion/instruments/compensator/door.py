@@ -38,7 +38,10 @@ class OffsetDoor:
             The limit is not above 0, or not finite.
         """
         if not (math.isfinite(limit) and limit > 0):
-            raise InstrumentError(f"{self._where}: expected a limit of the offsets above 0; found {limit!r}")
+            raise InstrumentError(
+                f"{self._where}: expected a limit of the offsets above 0; found {limit!r}",
+                code="offset.limit.not_positive",
+            )
         self.limit = float(limit)
 
     def disarm(self) -> None:
@@ -54,7 +57,9 @@ class OffsetDoor:
             The driver is not armed, or the values are not three finite numbers within the limit.
         """
         if not self.limit:
-            raise InstrumentError(f"{self._where} is not armed; it only reads. Nothing was sent")
+            raise InstrumentError(
+                f"{self._where} is not armed; it only reads. Nothing was sent", code="instrument.not_armed"
+            )
         try:
             found = [float(value) for value in values]
         except (TypeError, ValueError, OverflowError):
@@ -62,12 +67,14 @@ class OffsetDoor:
         if len(found) != 3 or not all(map(math.isfinite, found)):
             raise InstrumentError(
                 f"{self._where}: expected offsets of three finite numbers X, Y, Z; found {str(values)[:80]}. Nothing "
-                "was sent"
+                "was sent",
+                code="offset.form",
             )
         if max(map(abs, found)) > self.limit * (1 + ROUNDING):
             texts = ", ".join(f"{value * 1e6:.6g}" for value in found)
             raise InstrumentError(
                 f"{self._where}: an offset of {texts} um is beyond the limit of {self.limit * 1e6:g} um. Nothing was "
-                "sent"
+                "sent",
+                code="offset.beyond_limit",
             )
         return found[0], found[1], found[2]

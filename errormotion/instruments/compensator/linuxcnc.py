@@ -102,7 +102,8 @@ class LinuxCNCOffset(Driver):
             if found.limit < limit * (1 - 1e-6):
                 raise InstrumentError(
                     f"{self.address}: expected [ERRORMOTION] LIMIT of at least {1e6 * limit:g} um in LinuxCNC's INI "
-                    f"file; found {1e6 * found.limit:g} um"
+                    f"file; found {1e6 * found.limit:g} um",
+                    code="linuxcnc.limit.too_small",
                 )
             self._claim(self.transport)
         except BaseException:
@@ -149,7 +150,8 @@ class LinuxCNCOffset(Driver):
         if found.route != self.route:
             raise InstrumentError(
                 f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
-                f"{found.route}"
+                f"{found.route}",
+                code="linuxcnc.route.other",
             )
         return found
 
@@ -158,7 +160,9 @@ class LinuxCNCOffset(Driver):
             granted, other = codec.decode_right(self._hello(line, compensate=True))
             if not granted:
                 why = f"another program has it ({other})" if other else "start the bridge with --compensate"
-                raise InstrumentError(f"{self.address} refuses the right to set offsets: {why}")
+                raise InstrumentError(
+                    f"{self.address} refuses the right to set offsets: {why}", code="linuxcnc.right.refused"
+                )
         self._may_write = True
 
     def _hello(self, line: Transport, *, compensate: bool) -> Any:
@@ -183,7 +187,9 @@ class LinuxCNCOffset(Driver):
             self._drop()
             raise
         if not answer.ok:
-            raise InstrumentError(f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}")
+            raise InstrumentError(
+                f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}", code="linuxcnc.refused"
+            )
         return answer.result
 
     def _answer(self, line: Transport, number: int) -> codec.Answer:
@@ -191,12 +197,18 @@ class LinuxCNCOffset(Driver):
             message = codec.decode(line.read_until(codec.LINE_END, limit=codec.MAX_LINE))
         except InstrumentTimeoutError:
             raise InstrumentTimeoutError(
-                f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
+                f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s",
+                code="instrument.no_answer",
             ) from None
         if message.number is None and not getattr(message, "ok", True):
-            raise InstrumentError(f"{self.address}: the bridge ends the connection: {getattr(message, 'error', '')}")
+            raise InstrumentError(
+                f"{self.address}: the bridge ends the connection: {getattr(message, 'error', '')}",
+                code="connection.lost",
+            )
         if message.number != number or not isinstance(message, codec.Answer):
-            raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
+            raise ProtocolError(
+                f"{self.address}: expected the answer to request {number}; found {message}", code="protocol.reply.other"
+            )
         return message
 
 

@@ -91,7 +91,8 @@ class ModbusRegisters(ModbusDriver):
         if not scale <= limit <= largest:
             raise InstrumentError(
                 f"{self.address}: the registers represent offsets from {scale * 1e6:g} um to {largest * 1e6:g} um; the "
-                f"limit is {limit * 1e6:g} um. Change 'scale' or 'type'"
+                f"limit is {limit * 1e6:g} um. Change 'scale' or 'type'",
+                code="offset.range.too_small",
             )
         if self.settings.owner is not None:
             self._owner.take()

@@ -79,7 +79,9 @@ class OffsetFile:
         if self._open:
             return
         if not self.path.parent.is_dir():
-            raise InstrumentError(f"{self.address}: expected a folder {self.path.parent}; found none")
+            raise InstrumentError(
+                f"{self.address}: expected a folder {self.path.parent}; found none", code="offset.folder.missing"
+            )
         if self.path.exists():
             found = self._content(self.path)
             number = found.get("number", 0)
@@ -107,7 +109,10 @@ class OffsetFile:
         source = Path(self.settings.state) if self.settings.state else self.path
         if not source.exists():
             if self.settings.state:
-                raise InstrumentError(f"{source}: expected a file that the reader of offsets writes; found none")
+                raise InstrumentError(
+                    f"{source}: expected a file that the reader of offsets writes; found none",
+                    code="offset.file.missing",
+                )
             return Applied((0.0, 0.0, 0.0))
         found = self._content(source)
         offset = [_number(found.get(axis)) for axis in "XYZ"]
@@ -128,11 +133,15 @@ class OffsetFile:
         try:
             replace_text(self.path, json.dumps(content, allow_nan=False) + "\n")
         except (OSError, ValueError) as error:
-            raise InstrumentError(f"{self.address}: the offset cannot be written: {error}") from None
+            raise InstrumentError(
+                f"{self.address}: the offset cannot be written: {error}", code="offset.not_written"
+            ) from None
 
     def _require_open(self) -> None:
         if not self._open:
-            raise InstrumentError(f"The {self.info.id} at {self.address} is not open: call open() first")
+            raise InstrumentError(
+                f"The {self.info.id} at {self.address} is not open: call open() first", code="instrument.not_open"
+            )
 
     def _content(self, path: Path) -> dict[str, Any]:
         try:
@@ -145,7 +154,7 @@ class OffsetFile:
             if not isinstance(found, dict) or found.get("schema") != SCHEMA:
                 raise ValueError(f"expected an object with the schema {SCHEMA}")
         except (OSError, ValueError, RecursionError) as error:
-            raise InstrumentError(f"{path} is not a file of offsets: {error}") from None
+            raise InstrumentError(f"{path} is not a file of offsets: {error}", code="offset.file.form") from None
         return found
 
 

@@ -146,7 +146,8 @@ class OpcUaNodes(Driver):
             if not scale <= limit <= largest:
                 raise InstrumentError(
                     f"{self.address}: node '{node}' ({kind}) represents offsets from {scale * 1e6:g} um to "
-                    f"{largest * 1e6:g} um; the limit is {limit * 1e6:g} um. Change 'scale'"
+                    f"{largest * 1e6:g} um; the limit is {limit * 1e6:g} um. Change 'scale'",
+                    code="offset.range.too_small",
                 )
         if self.settings.owner:
             self._owner.take()
@@ -188,18 +189,26 @@ class OpcUaNodes(Driver):
         """Write values, each with its node and type."""
         statuses = request(line, {"write": values})
         if not isinstance(statuses, list) or len(statuses) != len(values):
-            raise ProtocolError(f"{self.address}: expected {len(values)} statuses; found {str(statuses)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected {len(values)} statuses; found {str(statuses)[:80]}",
+                code="protocol.opcua.count",
+            )
         refused = [
             f"{node}: {str(each)[:60]}" for (node, *_), each in zip(values, statuses, strict=True) if each != "Good"
         ]
         if refused:
-            raise InstrumentError(f"{self.address}: the server did not accept {what}: {', '.join(refused)}")
+            raise InstrumentError(
+                f"{self.address}: the server did not accept {what}: {', '.join(refused)}", code="opcua.write.refused"
+            )
 
     def _read_owner(self) -> int:
         (found,) = self._values([self.settings.owner])
         number = _number(found)
         if not math.isfinite(number):
-            raise InstrumentError(f"{self.address}: node '{self.settings.owner}' {_reason(found)}; expected the owner")
+            raise InstrumentError(
+                f"{self.address}: node '{self.settings.owner}' {_reason(found)}; expected the owner",
+                code="opcua.node.no_value",
+            )
         return int(number)
 
     def _write_owner(self, number: int) -> None:
@@ -217,7 +226,9 @@ class OpcUaNodes(Driver):
         answers = request(self.transport, {"read": list(nodes)})
         whole = isinstance(answers, list) and len(answers) == len(list(nodes))
         if not whole or not all(isinstance(each, dict) for each in answers):
-            raise ProtocolError(f"{self.address}: expected the values of nodes; found {str(answers)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected the values of nodes; found {str(answers)[:80]}", code="protocol.opcua.form"
+            )
         return list(answers)
 
     def _connect(self) -> Transport:
@@ -236,7 +247,9 @@ class OpcUaNodes(Driver):
         nodes = (*settings.offset, settings.heartbeat, *filter(None, (settings.owner,)))
         found = request(self.transport, {"describe": list(nodes)})
         if not isinstance(found, list) or len(found) != len(nodes) or not all(isinstance(each, dict) for each in found):
-            raise ProtocolError(f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}", code="protocol.opcua.form"
+            )
         types = [str(each.get("type")) for each in found]
         self._types, self._owner_type = types[:4], types[-1]
         for node, each, kind in zip(nodes, found, types, strict=True):
@@ -249,7 +262,8 @@ class OpcUaNodes(Driver):
                 array = "array of " if each.get("array") else ""
                 raise InstrumentError(
                     f"{self.address}: node '{node}': expected a number that can be written; found type "
-                    f"{array}{kind[:40]}, status {str(each.get('status'))[:60]}, writable {each.get('writable')}"
+                    f"{array}{kind[:40]}, status {str(each.get('status'))[:60]}, writable {each.get('writable')}",
+                    code="opcua.node.not_writable",
                 )
         (beat,) = self._values([settings.heartbeat])
         known = _number(beat)
@@ -257,7 +271,9 @@ class OpcUaNodes(Driver):
         self._beat = int(known) % self._beats if math.isfinite(known) else 0
         for node, value in zip(settings.read, self._values(settings.read), strict=True):
             if value.get("status") != "Good" or not isinstance(value.get("value"), bool | int | float):
-                raise InstrumentError(f"{self.address}: node '{node}' {_reason(value)}; expected a number")
+                raise InstrumentError(
+                    f"{self.address}: node '{node}' {_reason(value)}; expected a number", code="opcua.node.no_value"
+                )
 
 
 def _number(answer: dict[str, Any]) -> float:

@@ -83,5 +83,6 @@ class Owner:
         raise InstrumentError(
             f"{self._where}: another program writes the offsets of this machine, maybe on another computer: their "
             f"owner is {found}, this program is {self.number}. No offset was sent. Stop the other one; if it was "
-            "killed, the program of the machine sets the owner to 0 as its watchdog ends the compensation"
+            "killed, the program of the machine sets the owner to 0 as its watchdog ends the compensation",
+            code="offset.owner.other",
         )

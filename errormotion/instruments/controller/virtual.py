@@ -45,7 +45,7 @@ class Answer(NamedTuple):
     def result(self) -> Any:
         """The result; InstrumentError if the controller refuses."""
         if not self.ok:
-            raise InstrumentError(f"The controller refuses: {self.content}")
+            raise InstrumentError(f"The controller refuses: {self.content}", code="instrument.refused")
         return self.content
 
 
@@ -56,9 +56,13 @@ def decode_answer(line: bytes, number: int) -> Answer:
         matches, ok = answer["id"] == number, bool(answer["ok"])
         content = answer["result"] if ok else answer["error"]
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise ProtocolError(f"Expected an answer in JSON to request {number}; found {line[:200]!r}") from None
+        raise ProtocolError(
+            f"Expected an answer in JSON to request {number}; found {line[:200]!r}", code="protocol.reply.form"
+        ) from None
     if not matches:
-        raise ProtocolError(f"Expected the answer to request {number}; found {line[:200]!r}")
+        raise ProtocolError(
+            f"Expected the answer to request {number}; found {line[:200]!r}", code="protocol.reply.other"
+        )
     return Answer(ok, content)
 
 
@@ -74,7 +78,9 @@ def event_fields(event: Any) -> dict[str, Any]:
     names = ("time", "spindle_speed", "compensation")
     found = event if isinstance(event, Mapping) else {name: getattr(event, name, None) for name in names}
     if found.get("time") is None or set(found) - set(names):
-        raise InstrumentError(f"Expected an event with time, spindle_speed and compensation; found {event!r}")
+        raise InstrumentError(
+            f"Expected an event with time, spindle_speed and compensation; found {event!r}", code="event.form"
+        )
     fields: dict[str, Any] = {name: found[name] for name in names if found.get(name) is not None}
     if "compensation" in fields:
         fields["compensation"] = dict(fields["compensation"])
@@ -272,7 +278,7 @@ class VirtualController(Driver):
         """
         self._door.extent([float(step) * (count - 1) * float(u) for u in direction], "steps")
         if not all(math.isfinite(x) for x in start):
-            raise InstrumentError(f"Expected a start of three finite numbers; found {start!r}")
+            raise InstrumentError(f"Expected a start of three finite numbers; found {start!r}", code="position.form")
         self._door.feed(step / travel if travel > 0 else math.nan)
         return self._facts(
             "run_steps",
@@ -366,7 +372,9 @@ class VirtualController(Driver):
         try:
             position = None if found["position"] is None else [float(x) for x in found["position"]]
         except (TypeError, ValueError):
-            raise ProtocolError(f"Expected a position; found {str(found['position'])[:200]}") from None
+            raise ProtocolError(
+                f"Expected a position; found {str(found['position'])[:200]}", code="protocol.reply.form"
+            ) from None
         return {**found, "position": position}
 
     def spindle(self, speed: float) -> None:
@@ -394,7 +402,7 @@ class VirtualController(Driver):
     def act(self, action: str, **values: Any) -> None:
         """Do what an operator of a real machine would do: ``set_target`` or ``set_station``, with their arguments."""
         if action not in ("set_target", "set_station"):
-            raise InstrumentError(f"Expected the action set_target or set_station; found {action!r}")
+            raise InstrumentError(f"Expected the action set_target or set_station; found {action!r}", code="event.form")
         self._change(action, **values)
 
     def set_target(self, kind: str | None, inclination: float | None = None, rotation: float | None = None) -> None:
@@ -430,7 +438,9 @@ class VirtualController(Driver):
         found = self._call(op, **arguments) if op in _READING else self._change(op, **arguments)
         if not isinstance(found, dict) or (missing := [key for key in required if key not in found]):
             what = ", ".join(missing) if isinstance(found, dict) else ", ".join(required)
-            raise ProtocolError(f"The answer to '{op}' lacks {what}; found {str(found)[:200]}")
+            raise ProtocolError(
+                f"The answer to '{op}' lacks {what}; found {str(found)[:200]}", code="protocol.reply.field"
+            )
         return found
 
     def _events(self, schedule: Iterable[Any]) -> list[dict[str, Any]]:

@@ -116,7 +116,8 @@ def read_table(
     if len(tables) > 1:
         line = tables[1].head[0]
         raise DatasetError(
-            f"{path}, line {line}: expected one table without empty lines; found the start of a second table"
+            f"{path}, line {line}: expected one table without empty lines; found the start of a second table",
+            code="table.lengths.second",
         )
     (table,) = tables
     mistakes = Mistakes(path)
@@ -137,11 +138,15 @@ def read_table(
 
 def _refuse_long(path: Path) -> None:
     if (size := path.stat().st_size) > MAX_TABLE:
-        raise DatasetError(f"{path}: expected a table of at most {MAX_TABLE} bytes; found {size}")
+        raise DatasetError(
+            f"{path}: expected a table of at most {MAX_TABLE} bytes; found {size}", code="table.lengths.too_large"
+        )
     data = path.read_bytes()
     lines = len(data) - len(data.translate(None, _ENDS)) - data.count(b"\r\n") + sum(map(data.count, _LONG_ENDS))
     if lines > MAX_LINES:
-        raise DatasetError(f"{path}: expected a table of at most {MAX_LINES} lines; found {lines}")
+        raise DatasetError(
+            f"{path}: expected a table of at most {MAX_LINES} lines; found {lines}", code="table.lengths.too_large"
+        )
 
 
 def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
@@ -283,10 +288,14 @@ def _arranged(
 
 def _check_length(path: Path, length: Array, title: str, least: float) -> None:
     if not np.isfinite(length).any():
-        raise DatasetError(f"{path}: column '{title}': expected lengths; found none. Check that the table is complete")
+        raise DatasetError(
+            f"{path}: column '{title}': expected lengths; found none. Check that the table is complete",
+            code="table.lengths.none",
+        )
     longest = float(np.nanmax(np.abs(length)))
     if longest <= least:
         raise DatasetError(
             f"{path}: column '{title}': the longest length is {longest:.4g} m; check its unit. If it is correct, set "
-            f"'least_length' below {least:g} m"
+            f"'least_length' below {least:g} m",
+            code="table.lengths.unit_implausible",
         )

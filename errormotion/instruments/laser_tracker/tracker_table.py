@@ -86,7 +86,9 @@ class TrackerTable(Openable):
             return
         scheme, mark, rest = self.address.rpartition("://")
         if mark and scheme not in ("file", "replay"):
-            raise InstrumentError(f"Expected the path of a table, such as lengths.csv; found '{self.address}'")
+            raise InstrumentError(
+                f"Expected the path of a table, such as lengths.csv; found '{self.address}'", code="address.form"
+            )
         wrong = ReplayError if scheme == "replay" else InstrumentError
         path = Path(rest)
         try:
@@ -98,15 +100,17 @@ class TrackerTable(Openable):
                 least_length=self.settings.least_length,
             )
         except OSError as error:
-            raise wrong(f"The table {path} cannot be read: {error.strerror}") from None
+            raise wrong(f"The table {path} cannot be read: {error.strerror}", code="table.lengths.unreadable") from None
         except DatasetError as error:
-            raise wrong(str(error)) from error
+            raise wrong(str(error), code=error.code) from error
         if self._record is not None:
             try:
                 with self._record.open("xb") as copy:
                     copy.write(data)
             except OSError as error:
-                raise InstrumentError(f"The recording {self._record} cannot be created: {error.strerror}") from None
+                raise InstrumentError(
+                    f"The recording {self._record} cannot be created: {error.strerror}", code="recording.not_created"
+                ) from None
         self._digest, self._readings = hashlib.sha256(data).hexdigest(), readings
 
     def close(self) -> None:
@@ -123,7 +127,8 @@ class TrackerTable(Openable):
         """Contents of the table; InstrumentError before ``open``."""
         if self._readings is None:
             raise InstrumentError(
-                f"The tracker_table at {self.address} is not open: use it in a 'with' block, or call open() first"
+                f"The tracker_table at {self.address} is not open: use it in a 'with' block, or call open() first",
+                code="instrument.not_open",
             )
         return self._readings
 

@@ -82,7 +82,8 @@ class CompensatedSensor:
     ) -> None:
         if not hasattr(sensor, "mid_range"):
             raise InstrumentError(
-                f"Expected a point sensor that states the middle of its range (mid_range); found {sensor!r}"
+                f"Expected a point sensor that states the middle of its range (mid_range); found {sensor!r}",
+                code="sensor.mid_range.missing",
             )
         self.sensor = sensor
         self.calibration = _found(calibration)
@@ -131,7 +132,8 @@ class CompensatedSensor:
         q = tilt_vector(inclination, rotation)
         if not np.isfinite(q).all():
             raise InstrumentError(
-                f"Expected finite angles of the surface; found inclination {inclination}, rotation {rotation} rad"
+                f"Expected finite angles of the surface; found inclination {inclination}, rotation {rotation} rad",
+                code="sensor.surface.angle",
             )
         found = self.calibration.compensate(reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate)
         shape = np.shape(reading)  # one tilt for all of them adds no dimension

@@ -67,7 +67,8 @@ class CountedReadings:
         if gap > self._longest_gap:
             raise ProtocolError(
                 f"The counter of measured values jumps from {self._expected} to {block.counter}; "
-                "check that no other program has set up the controller"
+                "check that no other program has set up the controller",
+                code="protocol.counter.jump",
             )
         self._expected = (block.counter + block.count) % MODULUS
         if gap:

@@ -155,7 +155,7 @@ class CountingDriver(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
+            raise InstrumentError(f"{self.info.id} is streaming; close the stream first", code="stream.running")
 
     def _connect(self) -> Transport:
         from errormotion.instruments.transports.lines import open_lines
@@ -174,5 +174,6 @@ def check_range(stated: float | None, found: float, where: str, remedy: str) -> 
     if stated is not None and abs(stated - found) > RANGE_TOLERANCE * found:
         raise InstrumentError(
             f"The setting 'measuring_range' is {stated * 1e3:g} mm; the controller states {found * 1e3:g} mm{where}. "
-            f"Change the setting, or {remedy}"
+            f"Change the setting, or {remedy}",
+            code="sensor.range.differs",
         )

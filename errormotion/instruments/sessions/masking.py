@@ -44,7 +44,8 @@ def words_of(serial: str) -> list[str]:
     if (words and not long) or any(_masked(word) == word for word in long):
         raise InstrumentError(
             f"The serial number '{serial}' cannot be masked: expected a word of at least {SHORTEST} characters, not "
-            f"all of them {MASK_DIGIT} or {MASK_LETTER}"
+            f"all of them {MASK_DIGIT} or {MASK_LETTER}",
+            code="recording.mask.serial_form",
         )
     return long
 

@@ -150,7 +150,9 @@ def repeat(driver: Any, session: Mapping[str, Any]) -> Session:
         readings, blocks = int(session["readings"]["count"]), int(session["stream"]["count"])
         step = str(session["step"])
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise ReplayError("The note of the recording describes no session; record it again") from None
+        raise ReplayError(
+            "The note of the recording describes no session; record it again", code="recording.note.form"
+        ) from None
     readings += step == "readings"
     blocks += step == "stream"
     return _run(driver, lambda count: count < readings, lambda count: count < blocks, lambda: None)

@@ -101,7 +101,9 @@ def parse_fault(address: Address, offered: tuple[str, ...], *, every: int = 1) -
         return Fault()
     if kind not in offered:
         why = "this device does not have this fault" if kind in FAULTS else "unknown fault"
-        raise InstrumentError(f"'fault={kind}' in '{address.url}': {why}; expected one of {', '.join(offered)}")
+        raise InstrumentError(
+            f"'fault={kind}' in '{address.url}': {why}; expected one of {', '.join(offered)}", code="simulator.setting"
+        )
     return Fault(
         kind,
         at=int(address.number("fault_at", 0)),

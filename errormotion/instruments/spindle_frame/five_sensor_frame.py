@@ -89,7 +89,8 @@ class FiveSensorFrame(Openable):
             return dict(stated)
         if not self.address:
             raise InstrumentError(
-                "The five_sensor_frame needs 'addresses' in its settings, one URL for each of " + ", ".join(CHANNELS)
+                "The five_sensor_frame needs 'addresses' in its settings, one URL for each of " + ", ".join(CHANNELS),
+                code="frame.addresses.missing",
             )
         frame = parse_address(self.address)
         if frame.scheme == "sim":
@@ -100,7 +101,8 @@ class FiveSensorFrame(Openable):
             return {first: at_first} | {name: frame.line(name, 0).url for name in others}
         raise InstrumentError(
             f"'{self.address}' is the address of one device; expected 'addresses' in the settings, one URL for each of "
-            f"{', '.join(CHANNELS)}, or 'tcp://HOST:PORT?{'&'.join(f'{name}=PORT' for name in others)}'"
+            f"{', '.join(CHANNELS)}, or 'tcp://HOST:PORT?{'&'.join(f'{name}=PORT' for name in others)}'",
+            code="frame.addresses.missing",
         )
 
     # ------------------------------------------------------------------ opening and closing
@@ -126,7 +128,7 @@ class FiveSensorFrame(Openable):
                 try:
                     sensor.open()
                 except InstrumentError as error:
-                    raise type(error)(f"Channel {name}: {error}") from error
+                    raise error.restated(f"Channel {name}: {error}") from error
         except BaseException:
             for sensor in sensors.values():
                 with suppress(InstrumentError):
@@ -187,7 +189,7 @@ class FiveSensorFrame(Openable):
         """Return one distance of each channel, m, (channel,); NaN where a sensor has none."""
         for samples in self.stream(block=1):
             return np.asarray(samples.values[:, 0])
-        raise InstrumentError("The stream ended before its first sample")
+        raise InstrumentError("The stream ended before its first sample", code="stream.ended")
 
     def stream(self, channels: Sequence[str] | None = None, *, block: int | None = None) -> Iterator[Samples]:
         """Yield blocks of samples of all channels, aligned by their counters, until the caller stops.
@@ -215,9 +217,12 @@ class FiveSensorFrame(Openable):
         names = self.channels if channels is None else tuple(channels)
         sensors = self._open_sensors()
         if not names or len(set(names)) < len(names) or any(name not in sensors for name in names):
-            raise InstrumentError(f"Expected some of the channels {', '.join(CHANNELS)}, each once; found {names}")
+            raise InstrumentError(
+                f"Expected some of the channels {', '.join(CHANNELS)}, each once; found {names}",
+                code="frame.channels.unknown",
+            )
         if self._streaming:
-            raise InstrumentError("The frame is already streaming; close that stream first")
+            raise InstrumentError("The frame is already streaming; close that stream first", code="stream.running")
         size = block or max(1, round(BLOCK_SECONDS * self.rate))
         return self._stream({name: sensors[name] for name in names}, size)
 
@@ -238,5 +243,8 @@ class FiveSensorFrame(Openable):
 
     def _open_sensors(self) -> dict[str, Any]:
         if not self._sensors:
-            raise InstrumentError("The five_sensor_frame is not open: use it in a 'with' block, or call open() first")
+            raise InstrumentError(
+                "The five_sensor_frame is not open: use it in a 'with' block, or call open() first",
+                code="instrument.not_open",
+            )
         return self._sensors

@@ -93,5 +93,5 @@ def _read(item: tuple[str, Any]) -> tuple[float, str]:
     try:
         value = float(sensor.read())
     except InstrumentError as error:
-        raise type(error)(f"Channel {name}: {error}") from error
+        raise error.restated(f"Channel {name}: {error}") from error
     return value, f"{name} {getattr(sensor, 'no_value', '') or NO_VALUE}" if np.isnan(value) else ""

@@ -163,7 +163,9 @@ class FrameSettings(SensorSettings):
 def _driver(table: Mapping[str, Any]) -> Any:
     driver = plugins.get("instruments", str(table.get("driver", "")))
     if driver.info.kind != KIND:
-        raise PluginError(f"expected an instrument of kind {KIND}; found {driver.info.kind}")
+        raise PluginError(
+            f"expected an instrument of kind {KIND}; found {driver.info.kind}", code="frame.instrument.kind"
+        )
     return driver
 
 

@@ -76,7 +76,8 @@ def find_pdos(node: CanNode, inputs: Sequence[Input]) -> list[TransmitPdo]:
             f"{node.url}: node {node.node} sends none of its inputs in a PDO at SYNC or at an interval; map "
             f"{', '.join(f'0x{index:04X}:{subindex}' for index, subindex in sorted(values))} "
             "with the manufacturer's tool, with a transmission type of 1 to 240 or an event timer, or set "
-            "transfer = 'sdo'"
+            "transfer = 'sdo'",
+            code="thermometer.inputs.not_sent",
         )
     return [pdo for pdo in sent if any(pdo.place(*entry) for entry in values | states)]
 
@@ -91,11 +92,16 @@ def _find(node: CanNode, subindex: int, numbers: Sequence[Number], unit: int | N
             what = (
                 f"its values 0x{number.index:04X} are whole numbers, and it states no decimal digits (0x{DIGITS:04X})"
             )
-            raise InstrumentError(f"{where}: {what}; state them in the setting 'digits'")
+            raise InstrumentError(
+                f"{where}: {what}; state them in the setting 'digits'", code="thermometer.digits.unknown"
+            )
         decimals = stated
     code = _entry(node, UNIT, subindex, 4) if unit is None else unit
     if code is None:
-        raise InstrumentError(f"{where} states no unit (0x{UNIT:04X}); state it in the setting 'unit': degC, K or degF")
+        raise InstrumentError(
+            f"{where} states no unit (0x{UNIT:04X}); state it in the setting 'unit': degC, K or degF",
+            code="thermometer.unit.unknown",
+        )
     return Input(number, at, scale_of(code, decimals), _status(node, subindex))
 
 
@@ -110,7 +116,8 @@ def _value(node: CanNode, subindex: int, numbers: Sequence[Number]) -> tuple[Num
     asked = " or ".join(f"0x{number.index:04X}:{subindex}" for number in numbers)
     raise InstrumentError(
         f"{node.url}: node {node.node} has no input {subindex}: {asked} does not exist; state the subindices of its "
-        "inputs in the setting 'inputs'"
+        "inputs in the setting 'inputs'",
+        code="thermometer.input.missing",
     )
 
 
@@ -131,7 +138,7 @@ def _entry(node: CanNode, index: int, subindex: int, size: int) -> int | None:
         try:
             return node.unsigned(index, at, size)
         except SdoRefusal as refusal:
-            if refusal.code not in _MISSING:
+            if refusal.number not in _MISSING:
                 raise
     return None
 
@@ -140,5 +147,5 @@ def _has(node: CanNode, index: int, subindex: int) -> bool:
     try:
         node.upload(index, subindex)
     except SdoRefusal as refusal:
-        return refusal.code not in _MISSING
+        return refusal.number not in _MISSING
     return True

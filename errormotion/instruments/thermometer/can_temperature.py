@@ -143,7 +143,8 @@ class CanTemperature(Thermometer):
         device = node.unsigned(DEVICE_TYPE)
         if device & 0xFFFF != PROFILE:
             raise InstrumentError(
-                f"{self.address}: node {node.node} follows the profile CiA {device & 0xFFFF}; expected CiA {PROFILE}"
+                f"{self.address}: node {node.node} follows the profile CiA {device & 0xFFFF}; expected CiA {PROFILE}",
+                code="can.profile.other",
             )
         vendor = node.unsigned(IDENTITY, 1)
         product, serial = (_optional(node, IDENTITY, i) for i in (2, 4))
@@ -178,11 +179,11 @@ class CanTemperature(Thermometer):
             if wanted.status is not None:
                 status = int.from_bytes(self._entry(*wanted.status, frames)[:1], "little")
         except SdoRefusal as refusal:
-            if refusal.code in NO_VALUE:
+            if refusal.number in NO_VALUE:
                 return math.nan, NO_ANSWER
             raise
         except ProtocolError as error:
-            raise ProtocolError(f"{self.address}: node {self.node.node}, {error}") from None
+            raise ProtocolError(f"{self.address}: node {self.node.node}, {error}", code=error.code) from None
         return wanted.scale.celsius(value), flag_of(status, value)
 
     def _entry(self, index: int, subindex: int, frames: Mapping[int, bytes]) -> bytes:

@@ -60,7 +60,9 @@ class Number:
         """
         if len(data) not in (self.size, MAX_NUMBER):
             what = f"{'a whole number' if self.whole else 'a float'} of {self.size} bytes"
-            raise ProtocolError(f"0x{self.index:04X}: expected {what}; found {data.hex(' ') or 'none'}")
+            raise ProtocolError(
+                f"0x{self.index:04X}: expected {what}; found {data.hex(' ') or 'none'}", code="protocol.value.form"
+            )
         (value,) = struct.unpack_from(self.form, data)
         return float(value)
 
@@ -107,12 +109,15 @@ def scale_of(unit: int, digits: int = 0) -> Scale:
         An impossible number of digits.
     """
     if not 0 <= digits <= MAX_DIGITS:
-        raise ProtocolError(f"0x{DIGITS:04X}: expected 0 to {MAX_DIGITS} decimal digits; found {digits}")
+        raise ProtocolError(
+            f"0x{DIGITS:04X}: expected 0 to {MAX_DIGITS} decimal digits; found {digits}", code="protocol.reply.decimals"
+        )
     exponent = (unit >> 24 ^ 0x80) - 0x80 - digits  # the prefix is signed
     if unit & 0x00FFFFFF not in _ZEROS:
         raise InstrumentError(
             f"The unit of the input is 0x{unit:08X}; expected degC (0x{CELSIUS:08X}), K (0x{KELVIN:08X}) or degF "
-            f"(0x{FAHRENHEIT:08X}), with a prefix. If the code is wrong, state the unit in the setting 'unit'"
+            f"(0x{FAHRENHEIT:08X}), with a prefix. If the code is wrong, state the unit in the setting 'unit'",
+            code="thermometer.unit.unknown",
         )
     return Scale(exponent, *_ZEROS[unit & 0x00FFFFFF])
 

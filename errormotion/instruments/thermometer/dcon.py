@@ -51,12 +51,14 @@ def decode(line: bytes, *, with_checksum: bool = False) -> str:
     try:
         text = line.rstrip(b"\r\n").decode("ascii")
     except UnicodeDecodeError:
-        raise ProtocolError(f"Expected a line in ASCII; found {line!r}") from None
+        raise ProtocolError(f"Expected a line in ASCII; found {line!r}", code="protocol.text.form") from None
     if not with_checksum:
         return text
     body, check = text[:-2], text[-2:]
     if check != checksum(body):
-        raise ProtocolError(f"The answer '{body}' has the checksum '{check}'; expected '{checksum(body)}'")
+        raise ProtocolError(
+            f"The answer '{body}' has the checksum '{check}'; expected '{checksum(body)}'", code="protocol.checksum"
+        )
     return body
 
 
@@ -72,7 +74,9 @@ def parse_temperatures(text: str) -> list[float | None]:
     """
     values = _VALUE.findall(text)
     if not text.startswith(">") or not values or ">" + "".join(values) != text:
-        raise ProtocolError(f"Expected temperatures such as '>+025.12+026.00'; found '{text}'")
+        raise ProtocolError(
+            f"Expected temperatures such as '>+025.12+026.00'; found '{text}'", code="protocol.reply.number_form"
+        )
     return [_temperature(value) for value in values]
 
 
@@ -99,16 +103,18 @@ def check_configuration(text: str) -> None:
     """
     found = _CONFIGURATION.fullmatch(text)
     if found is None:
-        raise ProtocolError(f"Expected a configuration such as '100600'; found '{text}'")
+        raise ProtocolError(f"Expected a configuration such as '100600'; found '{text}'", code="protocol.reply.form")
     type_code, data_format = int(found[1], 16), int(found[2], 16)
     if type_code <= _LAST_ELECTRICAL_TYPE:
         raise InstrumentError(
-            f"The module is set to input range {found[1]}, a voltage or current; set it to the type of the sensors"
+            f"The module is set to input range {found[1]}, a voltage or current; set it to the type of the sensors",
+            code="thermometer.range.other",
         )
     if form := _FORMATS.get(data_format & 3):
         raise InstrumentError(
             f"The module reports {form} (data format {found[2]}); expected engineering units: set bits 1 and 0 of the "
-            "data format to 00"
+            "data format to 00",
+            code="thermometer.format.other",
         )
 
 
@@ -167,12 +173,14 @@ class DconTemperature(LineThermometer):
         found = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
         if len(found) < len(self.channels):
             raise ProtocolError(
-                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(found)}"
+                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(found)}",
+                code="thermometer.channels.too_few",
             )
         readings = dict(zip(self.channels, found, strict=False))
         if disabled := [name for name, value in readings.items() if value is None]:
             raise ProtocolError(
-                f"The channels of {', '.join(disabled)} are disabled in the module; enable or omit them"
+                f"The channels of {', '.join(disabled)} are disabled in the module; enable or omit them",
+                code="thermometer.channels.disabled",
             )
         return {
             name: (value, OPEN if value != value else GOOD) for name, value in readings.items() if value is not None
@@ -189,11 +197,14 @@ class DconTemperature(LineThermometer):
             line.write(encode(request, with_checksum=with_checksum))
             answer = decode(line.read_until(LINE_ENDS, limit=MAX_LINE_BYTES), with_checksum=with_checksum)
         if answer.startswith("?"):
-            raise InstrumentError(f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'")
+            raise InstrumentError(
+                f"The module {self._unit} at {self.address} refuses '{request}': '{answer}'", code="instrument.refused"
+            )
         if not answer.startswith(expected):
             echo = ". The line returns the request: set 'echo' to true" if answer.startswith(request) else ""
             raise ProtocolError(
-                f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'{echo}"
+                f"'{request}': expected an answer that starts with '{expected}'; found '{answer}'{echo}",
+                code="protocol.reply.form",
             )
         return answer.removeprefix(expected)
 

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from errormotion import plugins
 from errormotion.datasets.units import Length, Time, Velocity
-from errormotion.errors import InstrumentError, PluginError
+from errormotion.errors import InstrumentError, PluginError, code_of
 from errormotion.instruments.door import ArmedSettings, Door
 from errormotion.instruments.driver import Openable
 from errormotion.instruments.touch_probe.probe import Probe, corrected, refuse_unmapped
@@ -129,10 +129,14 @@ class ControllerProbe(Probe, Openable):
             armed = {"arm": self.settings.arm} if "arm" in cls.Settings.model_fields else {}
             settings = cls.Settings(**{**armed, **self.settings.controller_settings})
         except (PluginError, ValueError) as error:
-            raise InstrumentError(f"The controller '{self.settings.controller}' of the probe: {error}") from error
+            raise InstrumentError(
+                f"The controller '{self.settings.controller}' of the probe: {error}",
+                code=code_of(error, "probe.controller.settings"),
+            ) from error
         if not hasattr(cls, "probe"):
             raise InstrumentError(
-                f"The controller '{self.settings.controller}' cannot probe; choose one with probing moves"
+                f"The controller '{self.settings.controller}' cannot probe; choose one with probing moves",
+                code="probe.controller.no_probing",
             )
         control = cls(self.address, settings, record=self._record)
         if hasattr(control, "bound"):
@@ -151,7 +155,8 @@ class ControllerProbe(Probe, Openable):
         """The controller, opened; InstrumentError before ``open``."""
         if self._control is None:
             raise InstrumentError(
-                f"The controller_probe at {self.address} is not open: use it in a 'with' block, or call open() first"
+                f"The controller_probe at {self.address} is not open: use it in a 'with' block, or call open() first",
+                code="instrument.not_open",
             )
         return self._control
 
@@ -220,7 +225,7 @@ class ControllerProbe(Probe, Openable):
                 what = f"Touch {number + 1} of {len(touches)} (item {touch.item}): {error}"
                 if isinstance(error, StuckError):
                     yield self._keep(Contact(NOWHERE, self._time(), TRIPPED))
-                raise type(error)(what) from error
+                raise error.restated(what) from error
             except BaseException:  # an interruption must not leave the machine moving
                 self._stop()
                 raise
@@ -231,7 +236,8 @@ class ControllerProbe(Probe, Openable):
                 raise InstrumentError(
                     f"Touch {number + 1} of {len(touches)}: the probe did not trip on items {missed[0]} and "
                     f"{missed[1]} in succession. Check that it is connected and switched on. All motion has been "
-                    "stopped"
+                    "stopped",
+                    code="probe.touches.missed",
                 )
         if touches:
             self._leave(touches)
@@ -282,7 +288,9 @@ class ControllerProbe(Probe, Openable):
                 if state["homed"] is False
                 else "not enabled"
             )
-            raise InstrumentError(f"The machine at {self.address} is {what}; nothing was moved")
+            raise InstrumentError(
+                f"The machine at {self.address} is {what}; nothing was moved", code="machine.not_ready"
+            )
 
     def _time(self) -> float:
         try:

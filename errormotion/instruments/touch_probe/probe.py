@@ -74,7 +74,8 @@ def refuse_unmapped(pretravel: PretravelMap | None, touches: Sequence[Touch]) ->
         raise InstrumentError(
             f"The pre-travel map has no touches near the direction of touch {int(unknown[0]) + 1} (item {first.item}); "
             f"it does not cover {unknown.size} of {len(touches)} touches. Calibrate the probe in these directions, "
-            "or use no map"
+            "or use no map",
+            code="touch.pre_travel.not_covered",
         )
 
 

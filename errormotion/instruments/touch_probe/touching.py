@@ -39,6 +39,8 @@ class Prober(Protocol):
 class StuckError(InstrumentError):
     """The probe is tripped without a contact."""
 
+    code = "probe.tripped.before"
+
 
 @dataclass(frozen=True)
 class Strategy:
@@ -105,7 +107,8 @@ class Toucher:
             x, y, z = 1e3 * np.asarray(found["position"], dtype=float)
             raise InstrumentError(
                 f"the probe tripped at X {x:.3f} Y {y:.3f} Z {z:.3f} mm, where its path should be free; the machine "
-                "has stopped there. Remove the obstacle, or increase the clearance"
+                "has stopped there. Remove the obstacle, or increase the clearance",
+                code="probe.path.not_free",
             )
 
     def touch(self, touch: Touch) -> Contact:
@@ -122,7 +125,7 @@ class Toucher:
         path = target - start
         length = float(np.linalg.norm(path))
         if not length > 0:
-            raise InstrumentError("expected a touch whose target differs from its start")
+            raise InstrumentError("expected a touch whose target differs from its start", code="touch.target.same")
         direction = path / length
         origin = start
         for _ in range(1 + self._how.attempts):
@@ -183,7 +186,8 @@ class Toucher:
         if not (aside <= self._how.margin and -self._how.margin <= along <= length + self._how.margin):
             raise InstrumentError(
                 f"expected the probe to trip on its path of {1e3 * length:.3f} mm; the controller reports "
-                f"{1e3 * along:.3f} mm along it and {1e3 * aside:.3f} mm aside. Does it use machine coordinates?"
+                f"{1e3 * along:.3f} mm along it and {1e3 * aside:.3f} mm aside. Does it use machine coordinates?",
+                code="touch.path.other",
             )
         return along
 

@@ -83,7 +83,8 @@ def open_transport(
         case _:
             raise InstrumentError(
                 f"This instrument has no connection of type {address.scheme}: expected "
-                f"{', '.join(f'{each}://' for each in BYTES)}; found '{url}'"
+                f"{', '.join(f'{each}://' for each in BYTES)}; found '{url}'",
+                code="address.type",
             )
     if recorder is None:
         return transport
@@ -97,12 +98,17 @@ def open_transport(
 def load_simulator(name: str | None, url: str) -> Callable[[Address], Any]:
     """Return a function that starts the simulator ``module:Class`` at an address; InstrumentError without one."""
     if name is None:
-        raise InstrumentError(f"This instrument has no simulator: expected the address of a device; found '{url}'")
+        raise InstrumentError(
+            f"This instrument has no simulator: expected the address of a device; found '{url}'",
+            code="simulator.missing",
+        )
     module, _, attribute = name.partition(":")
     try:
         simulator = getattr(import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise InstrumentError(f"The simulator '{name}' for '{url}' does not load: {error}") from error
+        raise InstrumentError(
+            f"The simulator '{name}' for '{url}' does not load: {error}", code="simulator.not_loaded"
+        ) from error
 
     def start(address: Address) -> Any:
         from errormotion.instruments.transports.loopback.serving import placed

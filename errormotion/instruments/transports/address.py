@@ -66,7 +66,9 @@ class Address:
         try:
             return float(text)
         except ValueError:
-            raise InstrumentError(f"'{name}' in '{self.url}': expected a number; found '{text}'") from None
+            raise InstrumentError(
+                f"'{name}' in '{self.url}': expected a number; found '{text}'", code="address.number"
+            ) from None
 
     def line(self, name: str, default: int) -> Address:
         """Return the address of a further TCP line of the same device, at the port in the parameter ``name``.
@@ -78,14 +80,18 @@ class Address:
         """
         port = float(self.number(name, default))
         if not (port.is_integer() and 0 < port < 1 << 16):
-            raise InstrumentError(f"'{name}' in '{self.url}': expected a port from 1 to 65535; found {port:g}")
+            raise InstrumentError(
+                f"'{name}' in '{self.url}': expected a port from 1 to 65535; found {port:g}", code="address.number"
+            )
         return replace(self, url=f"tcp://{self.host}:{port:.0f}", port=int(port), params={})
 
     def whole(self, name: str, default: int, most: int) -> int:
         """Return a parameter as a whole number from 0 to ``most``; InstrumentError for another value."""
         value = float(self.number(name, default))
         if not (value.is_integer() and 0 <= value <= most):
-            raise InstrumentError(f"'{name}' in '{self.url}': expected a number from 0 to {most}; found {value:g}")
+            raise InstrumentError(
+                f"'{name}' in '{self.url}': expected a number from 0 to {most}; found {value:g}", code="address.number"
+            )
         return int(value)
 
     def with_path(self, path: str) -> str:
@@ -114,14 +120,16 @@ def parse_address(url: str) -> Address:
     if not mark or scheme not in SCHEMES:
         near = get_close_matches(scheme.lower(), SCHEMES, n=1) if mark else []
         hint = f"; did you mean {near[0]}://{rest}?" if near else ""
-        raise InstrumentError(f"Expected an address such as {_EXAMPLES}; found '{url}'{hint}")
+        raise InstrumentError(f"Expected an address such as {_EXAMPLES}; found '{url}'{hint}", code="address.form")
     if scheme == "replay":  # the rest is a file name; it may contain any characters
         if not rest:
-            raise InstrumentError(f"Expected the file of a recording, as in replay://FILE; found '{url}'")
+            raise InstrumentError(
+                f"Expected the file of a recording, as in replay://FILE; found '{url}'", code="address.form"
+            )
         return Address(url, scheme, path=rest)
     if scheme == "unix":  # likewise
         if not rest.startswith(("/", "~/")):
-            raise InstrumentError(f"Expected unix:///FOLDER/FILE or unix://~/FILE; found '{url}'")
+            raise InstrumentError(f"Expected unix:///FOLDER/FILE or unix://~/FILE; found '{url}'", code="address.form")
         return Address(url, scheme, path=rest)
     try:
         parts = urlsplit(url)
@@ -129,12 +137,13 @@ def parse_address(url: str) -> Address:
         params = dict(parse_qsl(parts.query, strict_parsing=True)) if parts.query else {}
     except ValueError as error:
         raise InstrumentError(
-            f"The address '{url}' cannot be read: {error}; expected an address such as {_EXAMPLES}"
+            f"The address '{url}' cannot be read: {error}; expected an address such as {_EXAMPLES}", code="address.form"
         ) from None
     if "@" in parts.netloc:  # it would be stored in recordings, runs and reports
         raise InstrumentError(
             f"Expected an address without a user name and password, which no driver sends, as in {scheme}://"
-            f"{parts.netloc.rpartition('@')[2]}; found one with '@'"
+            f"{parts.netloc.rpartition('@')[2]}; found one with '@'",
+            code="address.password",
         )
     serial = scheme in ("serial", "modbus+rtu")
     path = parts.path if serial else parts.path.removeprefix("/") if scheme == CAN else parts.path.strip("/")
@@ -144,5 +153,5 @@ def parse_address(url: str) -> Address:
     needed[OPC] = parts.hostname
     needed["modbus+tcp"] = needed["modbus+rtu-tcp"] = needed["tcp"]
     if not (path.strip("/") if serial else needed.get(scheme, True)):
-        raise InstrumentError(f"Expected {_FORMS[scheme]}; found '{url}'")
+        raise InstrumentError(f"Expected {_FORMS[scheme]}; found '{url}'", code="address.form")
     return Address(url, scheme, parts.hostname or "", port, path, params)

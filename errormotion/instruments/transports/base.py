@@ -83,7 +83,10 @@ class Transport(ABC):
         while not (found := _first(data, ends, searched, skip=len(ends) > 1)):
             if len(data) >= limit:
                 start = bytes(data[:32])
-                raise ProtocolError(f"{self.url}: {len(data)} bytes without {terminator!r}; they start with {start!r}")
+                raise ProtocolError(
+                    f"{self.url}: {len(data)} bytes without {terminator!r}; they start with {start!r}",
+                    code="protocol.reply.too_long",
+                )
             searched = max(len(data) - longest + 1, 0) if len(ends) == 1 else 0
             try:
                 data += self.read(limit, timeout=max(end - time.monotonic(), 0.0))
@@ -91,7 +94,8 @@ class Transport(ABC):
                 received = f"{bytes(data[:64])!r}" if data else "nothing"
                 raise InstrumentTimeoutError(
                     f"{self.url}: expected an answer that ends in {terminator!r} within {allowed:g} s; "
-                    f"received {received}"
+                    f"received {received}",
+                    code="instrument.no_answer",
                 ) from None
         self._rest = bytes(data[found:]) + self._rest
         return bytes(data[:found])
@@ -111,7 +115,8 @@ class Transport(ABC):
                 data += self.read(size - len(data), timeout=max(end - time.monotonic(), 0.0))
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
-                    f"{self.url}: expected {size} bytes within {allowed:g} s; received {len(data)}"
+                    f"{self.url}: expected {size} bytes within {allowed:g} s; received {len(data)}",
+                    code="instrument.no_answer",
                 ) from None
         return data
 

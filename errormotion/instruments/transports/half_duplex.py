@@ -46,7 +46,8 @@ class HalfDuplexTransport(Transport):
                     raise
                 raise InstrumentTimeoutError(
                     f"{self.url}: expected the echo {self._awaited[:24].hex(' ')} of the request within {timeout:g} s. "
-                    "Check the line, or the setting 'echo'"
+                    "Check the line, or the setting 'echo'",
+                    code="instrument.no_answer",
                 ) from None
             if data := self._without_zeros(self._without_echo(self._without_zeros(data))):
                 return data
@@ -65,7 +66,8 @@ class HalfDuplexTransport(Transport):
             self._awaited = b""
             raise ProtocolError(
                 f"{self.url}: expected the echo {awaited[:24].hex(' ')} of the request; found {data[:24].hex(' ')}. "
-                "Check the line, or the setting 'echo'"
+                "Check the line, or the setting 'echo'",
+                code="protocol.echo",
             )
         return data[size:]
 

@@ -125,11 +125,13 @@ def _opened(
             for name in (COMMAND, *further):
                 if name not in recordings:
                     raise ReplayError(
-                        f"The recording {address.path} has no line '{name}'; check the type of the device"
+                        f"The recording {address.path} has no line '{name}'; check the type of the device",
+                        code="recording.line.missing",
                     )
                 yield name, ReplayTransport(recordings[name], timeout=timeout)
         case _:
             raise InstrumentError(
                 f"This instrument has {len(further) + 1} network connections: expected tcp://HOST:PORT; "
-                f"found '{address.url}'"
+                f"found '{address.url}'",
+                code="address.type",
             )

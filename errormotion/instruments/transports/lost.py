@@ -52,12 +52,12 @@ class Reopened(Generic[Connection]):
             The connection is closed or cannot be opened, or the interval since the last attempt has not passed.
         """
         if self._closed:
-            raise InstrumentError(f"The connection to {self.url} is closed")
+            raise InstrumentError(f"The connection to {self.url} is closed", code="connection.closed")
         if self.connection is None:
             now = time.monotonic()
             if self.reason and now < self._last_attempt + self._interval:
                 left = self._last_attempt + self._interval - now
-                raise InstrumentError(f"{self.reason}; the next attempt is in {left:.1f} s")
+                raise InstrumentError(f"{self.reason}; the next attempt is in {left:.1f} s", code="connection.lost")
             self._last_attempt = now
             try:
                 self.connection = self._connect()

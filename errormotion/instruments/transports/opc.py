@@ -76,11 +76,15 @@ class OpcUaTransport(Transport):
         super().__init__(url, timeout)
         address = parse_address(url)
         if address.scheme not in (OPC, "sim"):
-            raise InstrumentError(f"Expected an address such as opc.tcp://192.168.0.5:4840; found '{url}'")
+            raise InstrumentError(
+                f"Expected an address such as opc.tcp://192.168.0.5:4840; found '{url}'", code="address.form"
+            )
         try:
             import asyncua  # noqa: F401 - an optional dependency
         except ImportError:
-            raise InstrumentError("OPC UA needs the package asyncua: pip install asyncua") from None
+            raise InstrumentError(
+                "OPC UA needs the package asyncua: pip install asyncua", code="package.missing"
+            ) from None
         logging.getLogger("asyncua").setLevel(logging.ERROR)  # users cannot act on its warnings
         self.simulated = address.scheme == "sim"
         self._device: Any = None
@@ -107,7 +111,9 @@ class OpcUaTransport(Transport):
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:  # noqa: ARG002 - the answer was received with the request
         if not self._answer:
-            raise InstrumentTimeoutError(f"{self.url}: no answer, since no request was sent")
+            raise InstrumentTimeoutError(
+                f"{self.url}: no answer, since no request was sent", code="instrument.no_answer"
+            )
         data, self._answer = self._answer[:max_bytes], self._answer[max_bytes:]
         return data
 
@@ -133,18 +139,24 @@ class OpcUaTransport(Transport):
             return self._run(asyncio.wait_for(work, self.timeout))
         except TimeoutError:
             self._drop()
-            raise InstrumentTimeoutError(f"{self.url}: no answer within {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"{self.url}: no answer within {self.timeout:g} s", code="instrument.no_answer"
+            ) from None
         except InstrumentError:
             raise
         except UaStatusCodeError as error:
-            raise InstrumentError(f"{self.url}: the server refuses: {error}{hint(error.code)}") from None
+            raise InstrumentError(
+                f"{self.url}: the server refuses: {error}{hint(error.code)}", code="instrument.refused"
+            ) from None
         except (OSError, UaError) as error:
             self._drop()
             reason = str(error) or type(error).__name__
-            raise InstrumentError(f"The connection to {self.url} is lost: {reason}") from None
+            raise InstrumentError(f"The connection to {self.url} is lost: {reason}", code="connection.lost") from None
         except Exception as error:  # noqa: BLE001 - the package raises various errors for damaged bytes
             self._drop()
-            raise ProtocolError(f"{self.url}: not an answer of an OPC UA server: {error!r}") from None
+            raise ProtocolError(
+                f"{self.url}: not an answer of an OPC UA server: {error!r}", code="protocol.opcua.form"
+            ) from None
 
     def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
@@ -192,7 +204,7 @@ class OpcUaTransport(Transport):
                 return await _describe(client, nodes[:MAX_NODES])
             case {"write": list(values)}:
                 return await _write(client, values[:MAX_NODES])
-        raise ProtocolError(f"{self.url}: unknown request {sorted(request)}")
+        raise ProtocolError(f"{self.url}: unknown request {sorted(request)}", code="protocol.opcua.request")
 
 
 async def _ended() -> None:
@@ -254,7 +266,7 @@ def _node(client: Client, node: str) -> Any:
     try:
         return client.get_node(ua.NodeId.from_string(node))
     except (UaError, ValueError, TypeError) as error:
-        raise InstrumentError(f"'{text(node)}' is not the id of a node: {error}") from None
+        raise InstrumentError(f"'{text(node)}' is not the id of a node: {error}", code="opcua.node.form") from None
 
 
 def _plain(value: ua.DataValue) -> dict[str, Any]:
@@ -332,4 +344,4 @@ def request(line: Transport, content: Mapping[str, Any]) -> Any:
     try:
         return json.loads(answer)
     except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"{line.url}: the answer is not JSON: {error}") from None
+        raise ProtocolError(f"{line.url}: the answer is not JSON: {error}", code="protocol.opcua.form") from None

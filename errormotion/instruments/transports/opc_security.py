@@ -61,7 +61,8 @@ class Credentials:
             password = Path(password_file).read_text(encoding="utf-8").splitlines()[0]
         except (OSError, IndexError, UnicodeDecodeError) as error:
             raise InstrumentError(
-                f"password_file '{password_file}': expected a file with the password; {error}"
+                f"password_file '{password_file}': expected a file with the password; {error}",
+                code="opcua.password.unreadable",
             ) from None
         return cls(security, user, password)
 
@@ -87,7 +88,8 @@ async def secure(client: Client, security: str) -> None:
     if len(parts) not in (4, 5) or parts[0] not in POLICIES or parts[1] not in MODES:
         raise InstrumentError(
             f"'security': expected POLICY,MODE,CERTIFICATE,KEY[,SERVER CERTIFICATE] with the policy "
-            f"{', '.join(POLICIES)} and the mode {' or '.join(MODES)}; found '{security}'"
+            f"{', '.join(POLICIES)} and the mode {' or '.join(MODES)}; found '{security}'",
+            code="opcua.security.form",
         )
     certificate = await _certificate(parts[2])
     await _check_key(parts[3])
@@ -100,7 +102,8 @@ async def secure(client: Client, security: str) -> None:
         raise
     except UaError as error:
         raise InstrumentError(
-            f"'security': the server has no endpoint with policy {parts[0]} and mode {parts[1]}: {error}"
+            f"'security': the server has no endpoint with policy {parts[0]} and mode {parts[1]}: {error}",
+            code="opcua.security.no_endpoint",
         ) from None
 
 
@@ -129,7 +132,9 @@ async def _certificate(path: str) -> Certificate:
     try:
         found: Certificate = await uacrypto.load_certificate(path)
     except (OSError, ValueError) as error:
-        raise InstrumentError(f"'security': expected a certificate (.pem or .der) in '{path}': {error}") from None
+        raise InstrumentError(
+            f"'security': expected a certificate (.pem or .der) in '{path}': {error}", code="opcua.security.certificate"
+        ) from None
     return found
 
 
@@ -140,4 +145,6 @@ async def _check_key(text: str) -> None:
     try:
         await uacrypto.load_private_key(path, password or None)
     except (OSError, ValueError, TypeError) as error:  # TypeError: with a password that is not needed, or without one
-        raise InstrumentError(f"'security': expected a private key (.pem or .der) in '{path}': {error}") from None
+        raise InstrumentError(
+            f"'security': expected a private key (.pem or .der) in '{path}': {error}", code="opcua.security.key"
+        ) from None

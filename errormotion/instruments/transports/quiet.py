@@ -53,7 +53,8 @@ def await_quiet(line: Transport, interval: float, since: float | None = None) ->
         if count > MAX_STRAY_BYTES or now - start > MAX_INTERVALS * interval:
             raise ProtocolError(
                 f"{line.url}: {count} bytes arrived in {now - start:.1f} s without a request; expected a line without "
-                f"data for {interval:g} s. Stop the output of the device, and open it again"
+                f"data for {interval:g} s. Stop the output of the device, and open it again",
+                code="protocol.unrequested",
             )
 
 
@@ -72,5 +73,6 @@ def after_others(error: InstrumentTimeoutError, count: int, what: str) -> Instru
         return error
     discarded = "1 answer to other requests was" if count == 1 else f"{count} answers to other requests were"
     return InstrumentTimeoutError(
-        f"{error}. No answer to {what} came, but {discarded} discarded: the device answers late, or other requests"
+        f"{error}. No answer to {what} came, but {discarded} discarded: the device answers late, or other requests",
+        code="instrument.no_answer",
     )

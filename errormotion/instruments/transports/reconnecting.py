@@ -91,7 +91,9 @@ class ReconnectingTransport(Transport):
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         line = self._line.connection
         if line is None:
-            raise InstrumentError(self._line.reason or f"The connection to {self.url} is closed")
+            raise InstrumentError(
+                self._line.reason or f"The connection to {self.url} is closed", code="connection.closed"
+            )
         try:
             data = line.read(max_bytes, timeout)
         except InstrumentTimeoutError:
@@ -188,4 +190,6 @@ def _connector(address: Address, timeout: float, baudrate: int | None) -> Callab
         from errormotion.instruments.transports.serial_line import SerialTransport
 
         return lambda: SerialTransport(address, timeout=timeout, baudrate=baudrate)
-    raise InstrumentError(f"This instrument needs a serial line or a TCP connection; found '{address.url}'")
+    raise InstrumentError(
+        f"This instrument needs a serial line or a TCP connection; found '{address.url}'", code="address.type"
+    )

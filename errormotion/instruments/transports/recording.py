@@ -54,6 +54,8 @@ MAX_RECORDING = 1 << 30
 class EndOfRecordingError(ReplayError):
     """The driver reads after the end of the recording."""
 
+    code = "replay.ended"
+
 
 class Recorder:
     """Writes the frames of one session to a new file; InstrumentError if the file exists or cannot be created."""
@@ -68,9 +70,13 @@ class Recorder:
                 "x", buffering=1, encoding="ascii", errors="backslashreplace"
             )
         except FileExistsError:
-            raise InstrumentError(f"The recording {path} already exists; choose another file or remove it") from None
+            raise InstrumentError(
+                f"The recording {path} already exists; choose another file or remove it", code="recording.exists"
+            ) from None
         except OSError as error:
-            raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
+            raise InstrumentError(
+                f"The recording {path} cannot be created: {error.strerror}", code="recording.not_created"
+            ) from None
         self._file.write(f"{FORMAT} {datetime.now(UTC).isoformat(timespec='seconds')} {address}\n")
 
     def frame(self, direction: str, data: bytes) -> None:
@@ -139,19 +145,29 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
     """
     try:
         if (size := require_regular(path).st_size) > MAX_RECORDING:
-            raise ReplayError(f"{path}: expected a recording of at most {MAX_RECORDING} bytes; found {size}")
+            raise ReplayError(
+                f"{path}: expected a recording of at most {MAX_RECORDING} bytes; found {size}",
+                code="recording.too_large",
+            )
         lines = path.read_text(encoding="ascii").splitlines()
     except OSError as error:
-        raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
+        raise ReplayError(
+            f"The recording {path} cannot be read: {error.strerror}", code="recording.unreadable"
+        ) from None
     except UnicodeDecodeError as error:
-        raise ReplayError(f"{path} is not a recording, or is damaged: byte {error.start} is not ASCII") from None
+        raise ReplayError(
+            f"{path} is not a recording, or is damaged: byte {error.start} is not ASCII", code="recording.damaged"
+        ) from None
     head = lines[0].split(" ", 2) if lines else []
     if len(head) != 3 or head[0] != (WITH_NOTE[FORMAT] if _has_note(lines) else FORMAT):
-        raise ReplayError(f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'")
+        raise ReplayError(
+            f"{path} is not a recording: expected a first line '{FORMAT} TIME ADDRESS'", code="recording.form"
+        )
     first = 1 + _has_note(lines)
     if len(lines) < 2 or not lines[-1].startswith("END "):
         raise ReplayError(
-            f"The recording {path} is incomplete: expected a last line that starts with 'END'; record it again"
+            f"The recording {path} is incomplete: expected a last line that starts with 'END'; record it again",
+            code="recording.incomplete",
         )
     frames: list[tuple[str, bytes]] = []
     crc = 0
@@ -164,10 +180,15 @@ def read_recording(path: Path) -> tuple[str, list[tuple[str, bytes]]]:
         except ValueError:
             valid = False
         if not valid:
-            raise ReplayError(f"{path}, line {number}: this frame was changed after the recording (wrong checksum)")
+            raise ReplayError(
+                f"{path}, line {number}: this frame was changed after the recording (wrong checksum)",
+                code="recording.damaged",
+            )
         frames.append((direction, data))
     if lines[-1] != f"END {len(frames)} {crc:08x}":
-        raise ReplayError(f"{path}: its last line does not match its {len(frames)} frames; record it again")
+        raise ReplayError(
+            f"{path}: its last line does not match its {len(frames)} frames; record it again", code="recording.damaged"
+        )
     return head[2], frames
 
 
@@ -205,10 +226,16 @@ class ReplayTransport(Transport):
             self._partial += data
             while self._partial:
                 if not self._writes:
-                    raise ReplayError(f"{self.url}: expected no further write; found {self._partial!r}")
+                    raise ReplayError(
+                        f"{self.url}: expected no further write; found {self._partial!r}",
+                        code="replay.write.unexpected",
+                    )
                 expected = self._writes[0]
                 if not expected.startswith(self._partial[: len(expected)]):
-                    raise ReplayError(f"{self.url}: expected the driver to write {expected!r}; found {data!r}")
+                    raise ReplayError(
+                        f"{self.url}: expected the driver to write {expected!r}; found {data!r}",
+                        code="replay.write.differs",
+                    )
                 if len(self._partial) < len(expected):
                     break
                 self._partial = self._partial[len(expected) :]
@@ -219,13 +246,16 @@ class ReplayTransport(Transport):
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         with self._change:
             if self._closed:
-                raise InstrumentError(f"The recording {self.url} is closed")
+                raise InstrumentError(f"The recording {self.url} is closed", code="connection.closed")
             if not self._reads:
                 raise EndOfRecordingError(f"{self.url}: the driver reads after the end of the recording")
             if not self._change.wait_for(self._readable, min(timeout, self.longest_wait)):
-                raise InstrumentTimeoutError(f"{self.url}: no data before the driver has written {self._writes[0]!r}")
+                raise InstrumentTimeoutError(
+                    f"{self.url}: no data before the driver has written {self._writes[0]!r}",
+                    code="instrument.no_answer",
+                )
             if self._closed:
-                raise InstrumentError(f"The recording {self.url} is closed")
+                raise InstrumentError(f"The recording {self.url} is closed", code="connection.closed")
             before, data = self._reads.popleft()
             if len(data) > max_bytes:
                 self._reads.appendleft((before, data[max_bytes:]))
@@ -252,7 +282,8 @@ class ReplayTransport(Transport):
         if left_bytes or left_writes or self._partial:
             raise ReplayError(
                 f"{self.url}: the driver stops before the end of the recording: {left_writes} writes "
-                f"and {left_bytes} bytes from the device remain"
+                f"and {left_bytes} bytes from the device remain",
+                code="replay.incomplete",
             )
 
 
@@ -266,7 +297,9 @@ def write_index(path: Path, parts: Sequence[str]) -> dict[str, Path]:
         with path.open("x", encoding="utf-8") as file:
             file.write(f"{INDEX_FORMAT}\n" + "".join(f"{part} {each.name}\n" for part, each in files.items()))
     except OSError as error:
-        raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
+        raise InstrumentError(
+            f"The recording {path} cannot be created: {error.strerror}", code="recording.not_created"
+        ) from None
     return files
 
 
@@ -274,20 +307,29 @@ def read_index(path: Path) -> dict[str, Path]:
     """Return the recordings in a list, by part; ReplayError if it is not such a list."""
     try:
         if (size := require_regular(path).st_size) > MAX_INDEX:
-            raise ReplayError(f"{path}: expected a list of recordings of at most {MAX_INDEX} bytes; found {size}")
+            raise ReplayError(
+                f"{path}: expected a list of recordings of at most {MAX_INDEX} bytes; found {size}",
+                code="recording.too_large",
+            )
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ReplayError(f"The recording {path} cannot be read: {error}") from None
+        raise ReplayError(f"The recording {path} cannot be read: {error}", code="recording.unreadable") from None
     expected = WITH_NOTE[INDEX_FORMAT] if _has_note(lines) else INDEX_FORMAT
     if (count := len(lines) - 1 - _has_note(lines)) > MAX_PARTS:
-        raise ReplayError(f"{path}: expected a list of at most {MAX_PARTS} recordings; found {count}")
+        raise ReplayError(
+            f"{path}: expected a list of at most {MAX_PARTS} recordings; found {count}", code="recording.too_many"
+        )
     pairs = [line.partition(" ") for line in lines[-count:]] if count > 0 else []
     if not lines or lines[0] != expected or not all(_is_name(name) for _, _, name in pairs):
-        raise ReplayError(f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'")
+        raise ReplayError(
+            f"{path} is not a list of recordings: expected a first line '{INDEX_FORMAT}'", code="recording.form"
+        )
     try:
         return {part: path.with_name(name) for part, _, name in pairs}
     except ValueError:
-        raise ReplayError(f"{path}: expected names of files in the folder of the list; found a path") from None
+        raise ReplayError(
+            f"{path}: expected names of files in the folder of the list; found a path", code="recording.outside"
+        ) from None
 
 
 def _is_name(text: str) -> bool:
@@ -301,7 +343,9 @@ def parts_of(path: Path, levels: int = 2) -> list[Path]:
         with path.open(encoding="utf-8", errors="replace") as file:
             word = file.readline(MAX_NOTE_BYTES).split(" ")[0].strip()
     except OSError as error:
-        raise ReplayError(f"The recording {path} cannot be read: {error.strerror}") from None
+        raise ReplayError(
+            f"The recording {path} cannot be read: {error.strerror}", code="recording.unreadable"
+        ) from None
     if word not in (INDEX_FORMAT, WITH_NOTE[INDEX_FORMAT]) or not levels:
         return [path]
     return [found for part in read_index(path).values() for found in parts_of(part, levels - 1)]
@@ -315,7 +359,8 @@ def add_note(path: Path, note: Mapping[str, Any]) -> None:
     text = NOTE + json.dumps(note, allow_nan=False)
     if len(text) > MAX_NOTE_BYTES:
         raise InstrumentError(
-            f"The note of the recording {path} has {len(text)} bytes; expected at most {MAX_NOTE_BYTES}"
+            f"The note of the recording {path} has {len(text)} bytes; expected at most {MAX_NOTE_BYTES}",
+            code="recording.note.too_long",
         )
     head = f"{word} {rest}".rstrip()
     replace_text(path, "\n".join([head, text, *lines[1 + _has_note(lines) :]]) + "\n")
@@ -330,11 +375,13 @@ def read_note(path: Path) -> dict[str, Any] | None:
             line = file.readline(MAX_NOTE_BYTES)
         note = json.loads(line.removeprefix(NOTE)) if line.startswith(NOTE) else None
     except UnicodeDecodeError:
-        raise ReplayError(f"{path} is not a recording: its first lines are not text") from None
+        raise ReplayError(f"{path} is not a recording: its first lines are not text", code="recording.form") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise ReplayError(f"The note of the recording {path} cannot be read: {error}") from None
+        raise ReplayError(
+            f"The note of the recording {path} cannot be read: {error}", code="recording.note.unreadable"
+        ) from None
     if note is not None and not isinstance(note, dict):
-        raise ReplayError(f"The note of the recording {path} is not a JSON object")
+        raise ReplayError(f"The note of the recording {path} is not a JSON object", code="recording.note.form")
     return note
 
 

@@ -26,7 +26,9 @@ class SerialTransport(Transport):
         parity, stop_bits = address.params.get("parity", "N"), address.whole("stopbits", 1, 2)
         data_bits, held = address.whole("databits", 8, 8), address.whole("xonxoff", 0, 1)
         if data_bits < 7:
-            raise InstrumentError(f"'databits' in '{address.url}': expected 7 or 8; found {data_bits}")
+            raise InstrumentError(
+                f"'databits' in '{address.url}': expected 7 or 8; found {data_bits}", code="address.number"
+            )
         self._port: serial.Serial | None = None
         try:
             self._port = serial.Serial(
@@ -40,20 +42,24 @@ class SerialTransport(Transport):
                 write_timeout=timeout,
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise InstrumentError(f"The serial line {self.url} cannot be opened at {speed} baud: {error}") from None
+            raise InstrumentError(
+                f"The serial line {self.url} cannot be opened at {speed} baud: {error}", code="connection.not_opened"
+            ) from None
 
     def _line(self) -> serial.Serial:
         if self._port is None:
-            raise InstrumentError(f"The serial line {self.url} is closed")
+            raise InstrumentError(f"The serial line {self.url} is closed", code="connection.closed")
         return self._port
 
     def _send(self, data: bytes) -> None:
         try:
             self._line().write(data)
         except serial.SerialTimeoutException:
-            raise InstrumentTimeoutError(f"{self.url} accepted no data for {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"{self.url} accepted no data for {self.timeout:g} s", code="instrument.no_answer"
+            ) from None
         except OSError as error:
-            raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
+            raise InstrumentError(f"The serial line {self.url} is lost: {error}", code="connection.lost") from None
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         port = self._line()
@@ -64,9 +70,9 @@ class SerialTransport(Transport):
             if data and max_bytes > 1 and (waiting := port.in_waiting):
                 data += port.read(min(waiting, max_bytes - 1))
         except (OSError, TypeError) as error:  # TypeError: from pyserial if the port is closed during the read
-            raise InstrumentError(f"The serial line {self.url} is lost: {error}") from None
+            raise InstrumentError(f"The serial line {self.url} is lost: {error}", code="connection.lost") from None
         if not data:
-            raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s")
+            raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s", code="instrument.no_answer")
         return data
 
     def close(self) -> None:

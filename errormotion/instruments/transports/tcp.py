@@ -44,17 +44,20 @@ class TcpTransport(Transport):
             self._connect(line)
         except TimeoutError:
             line.close()
-            raise InstrumentTimeoutError(f"No device answered at {self.url} within {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"No device answered at {self.url} within {self.timeout:g} s", code="instrument.no_answer"
+            ) from None
         except OSError as error:
             line.close()
             raise InstrumentError(
-                f"No connection to {self.url}: {error.strerror or error}; is the device on?"
+                f"No connection to {self.url}: {error.strerror or error}; is the device on?",
+                code="connection.not_opened",
             ) from None
         return line
 
     def _line(self) -> socket.socket:
         if self._socket is None:
-            raise InstrumentError(f"The connection to {self.url} is closed")
+            raise InstrumentError(f"The connection to {self.url} is closed", code="connection.closed")
         return self._socket
 
     def _send(self, data: bytes) -> None:
@@ -63,9 +66,13 @@ class TcpTransport(Transport):
             line.settimeout(self.timeout)
             line.sendall(data)
         except TimeoutError:
-            raise InstrumentTimeoutError(f"{self.url} accepted no data for {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"{self.url} accepted no data for {self.timeout:g} s", code="instrument.no_answer"
+            ) from None
         except OSError as error:
-            raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
+            raise InstrumentError(
+                f"The connection to {self.url} is lost: {error.strerror or error}", code="connection.lost"
+            ) from None
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:
         line = self._line()
@@ -73,11 +80,15 @@ class TcpTransport(Transport):
             line.settimeout(timeout)
             data = line.recv(max_bytes)
         except (TimeoutError, BlockingIOError):
-            raise InstrumentTimeoutError(f"{self.url} sent no data for {timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"{self.url} sent no data for {timeout:g} s", code="instrument.no_answer"
+            ) from None
         except OSError as error:
-            raise InstrumentError(f"The connection to {self.url} is lost: {error.strerror or error}") from None
+            raise InstrumentError(
+                f"The connection to {self.url} is lost: {error.strerror or error}", code="connection.lost"
+            ) from None
         if not data:
-            raise InstrumentError(f"The connection to {self.url} is lost: the device closed it")
+            raise InstrumentError(f"The connection to {self.url} is lost: the device closed it", code="connection.lost")
         return data
 
     def close(self) -> None:

@@ -150,7 +150,9 @@ def fit_cylinder(
         Parameters: point, direction and, where it was free, radius.
     """
     if radius is not None and not (np.isfinite(radius) and radius > 0):
-        raise FitError(f"expected a positive radius in the unit of the points; found {radius}")
+        raise FitError(
+            f"expected a positive radius in the unit of the points; found {radius}", code="shape.radius.not_positive"
+        )
     values = _fit(Cylinder(radius, _direction(direction)), _points(points, (3,)), robust, sigma, weights)
     return CylinderFit(**({"radius": radius} | values))
 
@@ -176,7 +178,9 @@ def fit_cone(
 def _fit(shape: Shape, points: Array, robust: bool, sigma: float | None, weights: ArrayLike | None) -> dict[str, Any]:
     """Return the fields of the result: the common ones, and the shape's parameters by name."""
     if sigma is not None and not (np.isfinite(sigma) and sigma > 0):
-        raise FitError(f"expected a positive sigma in the unit of the points; found {sigma}")
+        raise FitError(
+            f"expected a positive sigma in the unit of the points; found {sigma}", code="shape.sigma.not_positive"
+        )
     w = _weights(weights, len(points))
     left_out = outliers(shape, points, w, sigma) if robust else ()
     fitted = estimate(shape, points, w, sigma, left_out)
@@ -201,14 +205,19 @@ def _points(points: ArrayLike, dimensions: tuple[int, ...]) -> Array:
     try:
         p = np.asarray(points, dtype=float)
     except (TypeError, ValueError) as error:
-        raise FitError(f"expected points as an array of numbers; {error}") from error
+        raise FitError(f"expected points as an array of numbers; {error}", code="shape.points.form") from error
     if p.ndim != 2 or p.shape[1] not in dimensions:
         shapes = " or ".join(f"(n, {d})" for d in dimensions)
-        raise FitError(f"expected points of shape {shapes}, one row for each point; found {p.shape}")
+        raise FitError(
+            f"expected points of shape {shapes}, one row for each point; found {p.shape}", code="shape.points.shape"
+        )
     bad = np.flatnonzero(~np.isfinite(p).all(axis=1))
     if bad.size:
         named = ", ".join(str(i) for i in bad[:5]) + (", ..." if bad.size > 5 else "")
-        raise FitError(f"{bad.size} of {len(p)} points are not finite (rows {named}); remove them first")
+        raise FitError(
+            f"{bad.size} of {len(p)} points are not finite (rows {named}); remove them first",
+            code="shape.points.not_finite",
+        )
     return p
 
 
@@ -217,7 +226,9 @@ def _weights(weights: ArrayLike | None, n: int) -> Array:
         return np.ones(n)
     w = np.asarray(weights, dtype=float)
     if w.shape != (n,) or not (np.isfinite(w).all() and (w > 0).all()):
-        raise FitError(f"expected {n} positive weights, one for each point; remove points of weight 0")
+        raise FitError(
+            f"expected {n} positive weights, one for each point; remove points of weight 0", code="shape.weights.form"
+        )
     return w
 
 
@@ -226,5 +237,7 @@ def _direction(direction: ArrayLike | None) -> Array | None:
         return None
     u = np.asarray(direction, dtype=float)
     if u.shape != (3,) or not np.linalg.norm(u) > 0:
-        raise FitError(f"expected a direction of three numbers that are not all 0; found {direction}")
+        raise FitError(
+            f"expected a direction of three numbers that are not all 0; found {direction}", code="shape.direction.form"
+        )
     return np.asarray(u / np.linalg.norm(u))

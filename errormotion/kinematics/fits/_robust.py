@@ -42,12 +42,15 @@ def outliers(shape: Shape, points: Array, weights: Array, sigma: float | None) -
     if len(points) < shape.minimum + spare:
         raise FitError(
             f"a robust fit of a {shape.name} needs at least {shape.minimum + spare} points to distinguish outliers "
-            f"from the others; found {len(points)}"
+            f"from the others; found {len(points)}",
+            code="shape.points.too_few",
         )
     centre = np.median(points, axis=0)
     scale = float(np.median(np.linalg.norm(points - centre, axis=1)))
     if scale <= 10 * EPS * np.abs(points).max():
-        raise FitError(f"half of the points are one point; a {shape.name} needs distinct points")
+        raise FitError(
+            f"half of the points are one point; a {shape.name} needs distinct points", code="shape.points.not_distinct"
+        )
     frame = Frame(centre, scale)
     local, q, root = shape.scaled(scale), frame.inside(points), np.sqrt(weights)
     # Deviations below the rounding of the coordinates, or below the stated noise, are not significant.
@@ -101,7 +104,9 @@ def _least_trimmed(shape: Shape, q: Array, root: Array) -> tuple[Array, float]:
 
     starts = sorted(shape.robust_starts(q, rng), key=rank)[: shape.robust_tries]
     if not starts:
-        raise FitError(f"no small set of the points determines a {shape.name}; plot the points")
+        raise FitError(
+            f"no small set of the points determines a {shape.name}; plot the points", code="shape.undetermined"
+        )
     seen: set[bytes] = set()
     trimmed = [_concentrate(shape, theta, q, root, half, seen) for theta in starts]
     best = min((theta for theta in trimmed if theta is not None), key=rank)
@@ -171,4 +176,7 @@ def _misses(shape: Shape, theta: Array, q: Array, root: Array) -> Array:
 
 def _check_majority(shape: Shape, clean: Flags) -> None:
     if clean.sum() < max(shape.minimum + 1, (len(clean) + 1) // 2):
-        raise FitError(f"no {shape.name} fits at least half of the {len(clean)} points; the points have another shape")
+        raise FitError(
+            f"no {shape.name} fits at least half of the {len(clean)} points; the points have another shape",
+            code="shape.other",
+        )

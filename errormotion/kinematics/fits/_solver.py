@@ -98,7 +98,8 @@ def estimate(
     if not solution.converged:
         raise FitError(
             f"the fit of the {shape.name} did not converge: the points may have another shape. "
-            f"Plot them, or use a robust fit"
+            f"Plot them, or use a robust fit",
+            code="shape.not_converged",
         )
     dof = int(used.sum()) * shape.components - J.shape[1]
     estimated = float(np.sqrt(f @ f / dof)) if dof > 0 else np.nan
@@ -162,7 +163,10 @@ def _refined(shape: Shape, theta: Array, q: Array, root_weights: Array) -> Solut
 def _best(shape: Shape, q: Array, root_weights: Array) -> Solution:
     starts = shape.starts(q)
     if not starts:
-        raise FitError(f"the points do not determine one {shape.name}: several fit equally well. Add points elsewhere")
+        raise FitError(
+            f"the points do not determine one {shape.name}: several fit equally well. Add points elsewhere",
+            code="shape.ambiguous",
+        )
     if len(starts) > 1:
         part = np.unique(np.linspace(0, len(q) - 1, min(len(q), SEARCHED_POINTS)).astype(int))
         tried = [levenberg(shape, theta, q[part], root_weights[part], limit=60, refine=False) for theta in starts]
@@ -184,13 +188,19 @@ def _frame(shape: Shape, points: Array, weights: Array) -> Frame:
     centre = np.average(points, axis=0, weights=weights)
     scale = float(np.sqrt(np.mean((points - centre) ** 2) * points.shape[1]))
     if scale <= 10 * EPS * np.abs(points).max():
-        raise FitError(f"a {shape.name} needs {shape.minimum} distinct points; all {len(points)} are one point")
+        raise FitError(
+            f"a {shape.name} needs {shape.minimum} distinct points; all {len(points)} are one point",
+            code="shape.points.not_distinct",
+        )
     return Frame(centre, scale)
 
 
 def _enough(shape: Shape, points: Array) -> None:
     if len(points) < shape.minimum:
-        raise FitError(f"a {shape.name} needs at least {shape.minimum} points; found {len(points)}. Measure more")
+        raise FitError(
+            f"a {shape.name} needs at least {shape.minimum} points; found {len(points)}. Measure more",
+            code="shape.points.too_few",
+        )
 
 
 def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
@@ -202,7 +212,8 @@ def _refuse_flat(shape: Shape, points: Array, frame: Frame) -> None:
         undetermined = ", ".join(group.name for group in shape.groups)
         raise FitError(
             f"the points lie {where}, which leaves the {shape.name} undetermined ({undetermined}); it needs points "
-            f"that spread {'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}"
+            f"that spread {'over a plane' if shape.spans == 2 else 'in space'}{_repeated(shape, points)}",
+            code="shape.undetermined",
         )
 
 
@@ -215,7 +226,8 @@ def _undetermined(shape: Shape, points: Array, direction: Array) -> FitError:
         start += group.size
     return FitError(
         f"the points leave the {shape.name} undetermined: {' and '.join(names) or 'all parameters'} can change "
-        f"together without a change of the residuals. Add points elsewhere on it{_repeated(shape, points)}"
+        f"together without a change of the residuals. Add points elsewhere on it{_repeated(shape, points)}",
+        code="shape.undetermined",
     )
 
 
@@ -234,6 +246,7 @@ def _refuse_uncertain(shape: Shape, theta: Array, half: Array) -> None:
             raise FitError(
                 f"the noise hides the {group.name} of the {shape.name}: its standard uncertainty is "
                 f"{uncertainty / size:.2g} {'times its value' if group.kind == 'length' else 'rad'}. "
-                f"The points cover too little of the {shape.name}; distribute them, or fit a simpler shape"
+                f"The points cover too little of the {shape.name}; distribute them, or fit a simpler shape",
+                code="shape.hidden_by_noise",
             )
         start += group.size

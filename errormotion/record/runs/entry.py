@@ -102,7 +102,7 @@ def read_entry(folder: Path) -> Entry:
         with file.open("rb") as stream:
             raw = stream.read(MAX_READ)
     except OSError as error:
-        raise RunError(f"{file}: cannot be read: {error.strerror}") from error
+        raise RunError(f"{file}: cannot be read: {error.strerror}", code="run.file.unreadable") from error
     partial = ""
     try:
         if size > MAX_READ:
@@ -115,10 +115,10 @@ def read_entry(folder: Path) -> Entry:
         else:
             data = json.loads(raw)
     except (ValueError, RecursionError) as error:
-        raise RunError(f"{file}: is not valid JSON ({error})") from error
+        raise RunError(f"{file}: is not valid JSON ({error})", code="run.file.no_json") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
-        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}")
+        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}", code="run.file.schema")
     return Entry(
         folder.name,
         _text(data.get("created")),

@@ -243,14 +243,18 @@ def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
     count = 0
     for path in paths:
         if not path.is_dir():
-            raise RunError(f"{path}: no such folder; expected a run folder or a folder of runs")
+            raise RunError(
+                f"{path}: no such folder; expected a run folder or a folder of runs", code="run.folder.not_found"
+            )
         single = (path / "run.json").exists()
         for parent, name in (
             [(path.resolve().parent, path.resolve().name)] if single else _walk(path.resolve(), MAX_DEPTH)
         ):
             count += 1
             if count > MAX_RUNS:
-                raise RunError(f"{path}: expected at most {MAX_RUNS} runs; choose a folder with fewer runs")
+                raise RunError(
+                    f"{path}: expected at most {MAX_RUNS} runs; choose a folder with fewer runs", code="runs.too_many"
+                )
             found.setdefault(parent, {})[name] = None
             if not single:
                 whole.add(parent)

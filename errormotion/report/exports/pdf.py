@@ -68,7 +68,7 @@ def write(page: Path, out: Path) -> Path:
         else:
             _by_weasyprint(page, beside)
         if not beside.is_file() or not beside.read_bytes()[:5] == b"%PDF-":
-            raise RunError(f"{out}: {program or 'weasyprint'} did not write a PDF file")
+            raise RunError(f"{out}: {program or 'weasyprint'} did not write a PDF file", code="pdf.not_written")
     return out
 
 
@@ -85,13 +85,16 @@ def _by_browser(program: str, page: Path, out: Path) -> None:
                 command, stdin=subprocess.DEVNULL, capture_output=True, timeout=LONGEST, check=False, cwd=profile
             )
         except subprocess.TimeoutExpired as error:
-            raise RunError(f"{page}: {program} did not print it within {LONGEST:g} s") from error
+            raise RunError(f"{page}: {program} did not print it within {LONGEST:g} s", code="pdf.timeout") from error
         except OSError as error:
-            raise RunError(f"{page}: {program} could not be started: {error.strerror}") from error
+            raise RunError(
+                f"{page}: {program} could not be started: {error.strerror}", code="pdf.not_started"
+            ) from error
     if done.returncode:
         raise RunError(
             f"{page}: {program} could not print it (exit code {done.returncode}). "
-            f"{done.stderr.decode(errors='replace').strip()[-300:]}"
+            f"{done.stderr.decode(errors='replace').strip()[-300:]}",
+            code="pdf.failed",
         )
 
 
@@ -100,6 +103,6 @@ def _by_weasyprint(page: Path, out: Path) -> None:
         from weasyprint import HTML
         from weasyprint.urls import URLFetcher
     except (ImportError, OSError) as error:  # OSError: its own libraries are missing
-        raise RunError(WHAT_TO_INSTALL) from error
+        raise RunError(WHAT_TO_INSTALL, code="pdf.no_program") from error
     only_inside = URLFetcher(allowed_protocols=("data",))
     HTML(string=page.read_text(encoding="utf-8"), url_fetcher=only_inside).write_pdf(out)

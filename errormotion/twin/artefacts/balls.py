@@ -62,7 +62,7 @@ class Balls:
     def first(self, count: int) -> Balls:
         """Return the first ``count`` balls."""
         if not 1 <= count <= len(self):
-            raise BenchError(f"expected 1 to {len(self)} balls; found {count}")
+            raise BenchError(f"expected 1 to {len(self)} balls; found {count}", code="virtual.balls.count")
         part = slice(count)
         return replace(
             self, nominal=self.nominal[part], centre=self.centre[part], radius=self.radius[part], form=self.form[part]
@@ -71,7 +71,9 @@ class Balls:
     def moved(self, ball: int, shift: ArrayLike) -> Balls:
         """Return the balls with one of them (counted from 0) displaced by ``shift`` (3,), m."""
         if not 0 <= ball < len(self):
-            raise BenchError(f"expected the number of a ball, 0 to {len(self) - 1}; found {ball}")
+            raise BenchError(
+                f"expected the number of a ball, 0 to {len(self) - 1}; found {ball}", code="virtual.ball.number"
+            )
         centre = self.centre.copy()
         centre[ball] += np.asarray(shift, dtype=float)
         return replace(self, centre=centre)

@@ -84,7 +84,8 @@ def freeform(z: Surface, half_size: tuple[float, float] = (22e-3, 30e-3), *, nam
     if values.shape != grid[0].shape or not np.isfinite(values).all():
         raise BenchError(
             f"expected one finite height, m, for each position of the surface; found shape {values.shape} with "
-            f"{int(np.sum(~np.isfinite(values)))} values that are not finite, for positions of shape {grid[0].shape}."
+            f"{int(np.sum(~np.isfinite(values)))} values that are not finite, for positions of shape {grid[0].shape}.",
+            code="virtual.surface.heights",
         )
     table = np.ascontiguousarray(spline_filter(values, order=3, mode="mirror"))
     return Artefact(name, surfaces.FREEFORM, np.array([*half_size, x[0], y[0], 1 / KNOTS]), table)
@@ -140,5 +141,8 @@ def circular_pocket(
 
 def _positive(what: str, value: float) -> float:
     if not value > 0:
-        raise BenchError(f"expected the {what} of an artefact as a positive length in m; found {value!r}.")
+        raise BenchError(
+            f"expected the {what} of an artefact as a positive length in m; found {value!r}.",
+            code="virtual.artefact.length",
+        )
     return float(value)

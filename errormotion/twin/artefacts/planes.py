@@ -131,7 +131,8 @@ class SineGauge:
         if not 0 <= inclination <= self.steepest:
             raise BenchError(
                 f"expected an inclination from 0 to {np.degrees(self.steepest):g} deg; found "
-                f"{np.degrees(inclination):g} deg"
+                f"{np.degrees(inclination):g} deg",
+                code="virtual.plane.inclination",
             )
         flat = np.sin(inclination)
         return np.array([flat * np.cos(rotation), flat * np.sin(rotation), np.cos(inclination)])

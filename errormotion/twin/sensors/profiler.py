@@ -120,7 +120,10 @@ class Profiler:
             z in the profiler's frame, m; NaN = no reading.
         """
         if poses.ndim != 3 or poses.shape[1:] != (4, 4) or len(poses) < 2:
-            raise BenchError(f"expected poses of shape (line, 4, 4) with at least two lines; found {poses.shape}")
+            raise BenchError(
+                f"expected poses of shape (line, 4, 4) with at least two lines; found {poses.shape}",
+                code="virtual.poses.shape",
+            )
         wrong = self.disturbances
         poses = np.ascontiguousarray(poses, dtype=float)
         if wrong.jitter_y > 0:

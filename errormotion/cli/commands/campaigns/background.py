@@ -44,7 +44,10 @@ def answer(runs: Path, name: str | None) -> None:
     waiting = [each for each in processes.found(runs) if each.request is not None and name in (None, each.name)]
     if len(waiting) != 1 or waiting[0].request is None:
         names = ", ".join(each.name for each in waiting) or "none"
-        raise RunError(f"{runs}: expected one process with an open request; found {names}. Choose one with --process.")
+        raise RunError(
+            f"{runs}: expected one process with an open request; found {names}. Choose one with --process.",
+            code="process.ambiguous",
+        )
     processes.answer(runs, waiting[0].name, waiting[0].request.number)
     show(f"Done: {waiting[0].request.text}")
 
@@ -60,6 +63,9 @@ def stop(runs: Path, name: str | None) -> None:
     alive = [each for each in processes.found(runs) if each.alive and name in (None, each.name)]
     if len(alive) != 1:
         names = ", ".join(each.name for each in alive) or "none"
-        raise RunError(f"{runs}: expected one process that runs; found {names}. Choose one with --process.")
+        raise RunError(
+            f"{runs}: expected one process that runs; found {names}. Choose one with --process.",
+            code="process.ambiguous",
+        )
     processes.stop(runs, alive[0].name)
     show(f"{alive[0].campaign}: stop requested. 'errormotion run --resume' continues it.")

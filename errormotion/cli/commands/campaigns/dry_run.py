@@ -42,7 +42,7 @@ def _drawn(plan: CampaignPlan, found: Motions, out: Path) -> Path:
     """Draw the motions of a test, and return the file."""
     path = out / f"{found.test}-dry-run.png"
     if path.exists():
-        raise BenchError(f"{path}: already exists; choose another folder, or remove the file")
+        raise BenchError(f"{path}: already exists; choose another folder, or remove the file", code="file.exists")
     out.mkdir(parents=True, exist_ok=True)
     picture(plan, found).savefig(path, dpi=110)
     return path

@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import USAGE
-from errormotion.cli.output import show
+from errormotion.cli.guard import UsageError
 from errormotion.cli.root import app, background_app
 
 Move = Annotated[bool, typer.Option("--move", help="Release the motions of the machine without a question.")]
@@ -76,13 +75,11 @@ def run(
         from errormotion.cli.commands.campaigns import dry_run as dry
 
         if campaign is None or resume or campaign.is_dir():
-            show("--dry-run: expected a campaign file and no --resume.", err=True)
-            raise typer.Exit(USAGE)
+            raise UsageError("--dry-run: expected a campaign file and no --resume.", code="option.not_allowed")
         dry.run(campaign, out, json_)
         return
     if out is not None:
-        show("--out is allowed with --dry-run only.", err=True)
-        raise typer.Exit(USAGE)
+        raise UsageError("--out is allowed with --dry-run only.", code="option.not_allowed")
     from errormotion.cli.commands.campaigns import run as command
 
     if detach:

@@ -24,10 +24,13 @@ def expect(campaign: Path, test: str | None, out: Path | None, as_json: bool) ->
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
     if not chosen:
         raise BenchError(
-            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
+            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'",
+            code="campaign.test.unknown",
         )
     if out is not None and len(chosen) > 1:
-        raise BenchError(f"{campaign}: --out writes the plan of one test; choose it with --test")
+        raise BenchError(
+            f"{campaign}: --out writes the plan of one test; choose it with --test", code="campaign.test.ambiguous"
+        )
     with working("Computing the expected uncertainty"):
         found = [(entry, planned(plan, entry)) for entry in chosen]
     if out is not None:

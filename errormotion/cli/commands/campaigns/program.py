@@ -31,12 +31,15 @@ def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: b
     chosen = [entry for entry in plan.tests if test is None or entry.name == test]
     if not chosen:
         raise BenchError(
-            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'"
+            f"{campaign}: expected one of the tests {', '.join(entry.name for entry in plan.tests)}; found '{test}'",
+            code="campaign.test.unknown",
         )
     with_programs = [entry for entry in chosen if states(entry.method, "programs")]
     if not with_programs:
         names = ", ".join(sorted({entry.method.info.id for entry in chosen}))
-        raise BenchError(f"{campaign}: the method {names} has no NC programs; nothing was written")
+        raise BenchError(
+            f"{campaign}: the method {names} has no NC programs; nothing was written", code="campaign.programs.none"
+        )
     files: list[tuple[str, Path, str]] = []
     for entry in with_programs:
         folder = out / entry.name if len(with_programs) > 1 else out
@@ -45,7 +48,8 @@ def write(campaign: Path, test: str | None, out: Path, *, move: bool, as_json: b
         files += [(entry.name, folder / name, text) for name, text in texts.items()]
     if existing := [str(path) for _, path, _ in files if path.exists()]:
         raise BenchError(
-            f"{existing[0]} already exists; choose another folder, or remove the file. Nothing was written."
+            f"{existing[0]} already exists; choose another folder, or remove the file. Nothing was written.",
+            code="file.exists",
         )
     for entry in with_programs:
         show(announced(plan, entry), err=True)

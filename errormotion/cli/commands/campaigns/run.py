@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import typer
-
 from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.background import processes
@@ -16,7 +14,7 @@ from errormotion.campaign.files import CampaignPlan, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.campaign.planning.release import Release, refuse, released
 from errormotion.cli.commands.campaigns import background as command
-from errormotion.cli.guard import USAGE
+from errormotion.cli.guard import UsageError
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars, on_terminal
 from errormotion.cli.summary import as_printed, figure_table, notes_of
@@ -40,14 +38,14 @@ def run(
 ) -> None:
     """Run or resume a campaign and print its results."""
     if campaign is None and not resume:
-        show("Expected a campaign file, or --resume to continue the newest unfinished campaign.", err=True)
-        raise typer.Exit(USAGE)
-    if tolerances is not None and (resume or campaign is None):
-        show(
-            "--tolerances is not allowed with --resume. Resume first, then: errormotion report RUN --tolerances FILE",
-            err=True,
+        raise UsageError(
+            "Expected a campaign file, or --resume to continue the newest unfinished campaign.", code="option.missing"
         )
-        raise typer.Exit(USAGE)
+    if tolerances is not None and (resume or campaign is None):
+        raise UsageError(
+            "--tolerances is not allowed with --resume. Resume first, then: errormotion report RUN --tolerances FILE",
+            code="option.not_allowed",
+        )
     limits = load_tolerances(tolerances) if tolerances else None
     run_id = ""
     if resume and campaign is not None and campaign.is_dir():
@@ -105,8 +103,7 @@ def work(
 def detach(campaign: Path | None, *, resume: bool, runs: Path | None, move: bool, as_json: bool) -> None:
     """Start or resume a campaign in a separate process, and print the name of the process."""
     if campaign is None:
-        show("--detach: expected a campaign file, or a run folder with --resume.", err=True)
-        raise typer.Exit(USAGE)
+        raise UsageError("--detach: expected a campaign file, or a run folder with --resume.", code="option.missing")
     release = released if move else Bars(quiet=True).release if on_terminal() else refuse
     if resume:
         command.started(processes.resume(campaign, release), campaign.parent, as_json)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from errormotion.campaign.compensation.following import AUDIT, compensations, is_working, read_status, request_stop
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import failure, show, show_json, table
 from errormotion.compensation.online.audit import Verdict, check
 from errormotion.errors import CompensationError
 
@@ -18,10 +18,15 @@ def status(path: Path, as_json: bool) -> int:
     """
     folders = [path] if (path / AUDIT).is_file() else list(compensations(path))
     if not folders:
-        raise CompensationError(f"{path}: expected the run folder of a compensation, or a folder of such runs")
+        raise CompensationError(
+            f"{path}: expected the run folder of a compensation, or a folder of such runs",
+            code="compensation.folder.other",
+        )
     found = [_state_of(folder) for folder in folders]
     if as_json:
-        show_json({"ok": not any(each["broken"] for each in found), "compensations": found})
+        broken = [each["broken"] for each in found if each["broken"]]
+        error = failure("\n".join(broken), code="audit.broken") if broken else {}
+        show_json({"ok": not broken, "compensations": found, **error})
     else:
         show(
             table(

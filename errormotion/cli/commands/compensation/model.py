@@ -135,7 +135,9 @@ def errors_of(path: Path) -> xr.Dataset:
     """Return the error dataset of a file or of a run folder."""
     ds = dataset_of(path)
     if ds.attrs.get("schema") != SCHEMA:
-        raise DatasetError(f"{path}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}")
+        raise DatasetError(
+            f"{path}: expected schema {SCHEMA}; found {ds.attrs.get('schema', 'none')}", code="schema.other"
+        )
     return ds
 
 
@@ -152,7 +154,7 @@ def dataset_of(path: Path) -> xr.Dataset:
         folder = RunFolder.open(path)
         path = folder.errors or folder.raw
         if not path.exists():
-            raise RunError(f"{folder.path}: the run has neither errors nor raw data yet")
+            raise RunError(f"{folder.path}: the run has neither errors nor raw data yet", code="run.no_errors")
     with reading(path), datasets.load(path) as ds:
         if ds.attrs.get("schema") == SCHEMA:
             datasets.validate(ds)

@@ -60,7 +60,7 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     """
     target = out or part.with_name(f"{part.stem}.corrected{part.suffix}")
     if target.exists():
-        raise ProgramError(f"{target}: already exists, and is not replaced; give another name")
+        raise ProgramError(f"{target}: already exists, and is not replaced; give another name", code="file.exists")
     settings = Settings(
         tolerance=quantity("--tolerance", choice.tolerance, Length),
         step=quantity("--sampling", choice.sampling, Length),
@@ -113,7 +113,9 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
 
 def _correction(sources: list[Any], choice: Choice) -> Correction:
     if choice.temperatures is None and not all(isinstance(source, xr.Dataset) for source in sources):
-        raise DatasetError("a thermal model needs temperatures: give --temperatures LOG")
+        raise DatasetError(
+            "a thermal model needs temperatures: give --temperatures LOG", code="correction.temperatures.missing"
+        )
     data = None if choice.temperatures is None else dataset_of(choice.temperatures)
     return correction(sources, choice.functional_point, data=data, partial=choice.partial)
 
@@ -229,5 +231,5 @@ def _show(
 
 def _one_of(option: str, text: str, allowed: tuple[str, ...]) -> str:
     if text not in allowed:
-        raise ProgramError(f"{option} {text}: expected one of {', '.join(allowed)}")
+        raise ProgramError(f"{option} {text}: expected one of {', '.join(allowed)}", code="option.choice")
     return text

@@ -11,7 +11,8 @@ import numpy as np
 from errormotion.campaign.bench import OpenBench
 from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import BenchPlan, load_bench
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import failure, show, show_json, table
+from errormotion.errors import code_of
 
 MAX_NUMBERS = 12
 """Largest number of values of a reading that are printed; a longer reading is summarized."""
@@ -32,19 +33,22 @@ def _probe(plan: BenchPlan, as_json: bool) -> bool:
     try:
         bench.try_open()
         for answer in bench.answers:
-            record = answer.record() | {"error": answer.error, "reading": None}
+            record = answer.record() | {"error": answer.error, "code": answer.code, "reading": None}
             if answer.driver is not None:
                 try:
                     record["reading"] = _plain(answer.driver.read())
                 except Exception as error:
                     log.exception("instrument %s: the reading failed", answer.instrument.name)
                     record["error"] = f"{type(error).__name__}: {error}"
+                    record["code"] = code_of(error, "error.internal")
             found.append(record)
     finally:
         bench.close()
-    good = not any(record["error"] for record in found)
+    bad = [f"{record['name']}: {record['error']}" for record in found if record["error"]]
+    good = not bad
     if as_json:
-        show_json({"ok": good, "bench": bench.plan.name, "machine": bench.plan.machine, "instruments": found})
+        about = {"bench": bench.plan.name, "machine": bench.plan.machine, "instruments": found}
+        show_json({"ok": good, **about, **(failure("\n".join(bad), code="bench.not_ready") if bad else {})})
     else:
         rows = [
             [

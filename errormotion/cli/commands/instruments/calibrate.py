@@ -48,5 +48,5 @@ def _calibration_of(data: Path, schema: str) -> Calibration:
     found: Calibration | None = None if owner is None else owner.calibrations.get(schema)
     if found is None:
         known = {name for _, made in plugins.brought("calibrations", "methods", "datasets") for name in made}
-        raise DatasetError(f"{data}: expected schema {' or '.join(sorted(known))}; found {schema}")
+        raise DatasetError(f"{data}: expected schema {' or '.join(sorted(known))}; found {schema}", code="schema.other")
     return found

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from errormotion.cli import options
-from errormotion.cli.guard import ERROR, INVALID
+from errormotion.cli.guard import ERROR, INVALID, fail
 from errormotion.cli.output import show, show_json, table
 from errormotion.cli.root import app, bench_app
 
@@ -22,10 +22,8 @@ def bench_validate(file: Annotated[Path, typer.Argument(help="A bench file.")], 
     try:
         plan = load_bench(file)
     except BenchError as error:
-        if json_:
-            show_json({"ok": False, "file": str(file), "message": str(error)})
-        show(str(error), err=True)
-        raise typer.Exit(INVALID) from error
+        fail(str(error), error, INVALID, json_)
+        return
     rows = [[i.name, i.driver.info.id, i.driver.info.kind, i.address] for i in plan.instruments]
     if json_:
         keys = ("name", "driver", "kind", "address")

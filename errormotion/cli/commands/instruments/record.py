@@ -14,7 +14,7 @@ from errormotion import __version__, plugins
 from errormotion.campaign.claims import claimed, uses
 from errormotion.campaign.files import BenchInstrument, load_bench
 from errormotion.cli import options
-from errormotion.cli.output import show, show_json
+from errormotion.cli.output import failure, show, show_json
 from errormotion.errors import BenchError, InstrumentError, ReplayError
 from errormotion.instruments.sessions.masking import holds, mask, words_of
 from errormotion.instruments.sessions.session import Session, differences, repeat, run_live
@@ -35,7 +35,9 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
     instrument = _instrument(bench, name)
     path = out or Path(f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}.rec")
     if path.exists():
-        raise InstrumentError(f"The recording {path} already exists; choose another file or remove it")
+        raise InstrumentError(
+            f"The recording {path} already exists; choose another file or remove it", code="recording.exists"
+        )
     early: dict[Path, int] = {}  # number of frames before the identity was known
     with claimed(uses(load_bench(bench), only=name), "a recording"):
         session = run_live(
@@ -45,7 +47,9 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
             lambda: early.update({each: len(each.read_bytes().splitlines()) - 1 for each in _files(path)}),
         )
     if not path.is_file():
-        raise InstrumentError(session.message or f"Nothing was recorded from the instrument '{name}'")
+        raise InstrumentError(
+            session.message or f"Nothing was recorded from the instrument '{name}'", code="recording.nothing"
+        )
     note = _note(instrument, session)
     add_note(path, note)
     if mask_serial:
@@ -53,7 +57,8 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
     files = [path, *(part for part in parts_of(path) if part != path)]
     if as_json:
         found = read_note(path)
-        show_json({"ok": not session.step, "files": [str(each) for each in files], "note": found})
+        error = failure(session.message, code="recording.incomplete") if session.step else {}
+        show_json({"ok": not session.step, "files": [str(each) for each in files], "note": found, **error})
         return not session.step
     if session.step:
         show(f"The session ended in the step '{session.step}' with {session.error}: {session.message}")
@@ -67,7 +72,10 @@ def record(bench: Path, name: str, duration: str, out: Path | None, mask_serial:
 def replay(path: Path, as_json: bool) -> bool:
     """Run the driver on a recording, print its readings, and return whether the session was reproduced."""
     if (size := sum(part.stat().st_size for part in {path, *parts_of(path)})) > MAX_REPLAY:
-        raise ReplayError(f"The recording {path} has {size / 1e6:.0f} MB; expected at most {MAX_REPLAY / 1e6:.0f} MB")
+        raise ReplayError(
+            f"The recording {path} has {size / 1e6:.0f} MB; expected at most {MAX_REPLAY / 1e6:.0f} MB",
+            code="recording.too_large",
+        )
     note, session, found = _played(path)
     frames = sum(len(read_recording(part)[1]) for part in parts_of(path))
     if as_json:
@@ -81,6 +89,7 @@ def replay(path: Path, as_json: bool) -> bool:
                 "differences": found,
                 **about,
                 **session.record(),
+                **(failure("\n".join(found), code="recording.not_reproduced") if found else {}),
             }
         )
         return not found
@@ -107,14 +116,16 @@ def _played(path: Path) -> tuple[dict[str, Any], Session, list[str]]:
     if note is None or "session" not in note or "plugin" not in note:
         raise ReplayError(
             f"The recording {path} states no instrument; 'errormotion record' did not make it. Open replay://{path} "
-            "with its driver instead"
+            "with its driver instead",
+            code="recording.no_instrument",
         )
     cls = plugins.get("instruments", str(note["plugin"]))
     try:
         settings = cls.Settings.model_validate(note.get("settings"))
     except ValidationError as error:
         raise ReplayError(
-            f"The settings in the recording {path} are not those of '{note['plugin']}': {error}"
+            f"The settings in the recording {path} are not those of '{note['plugin']}': {error}",
+            code="recording.settings",
         ) from None
     session = repeat(cls(f"replay://{path}", settings), note["session"])
     return note, session, differences(note["session"], session)
@@ -140,21 +151,26 @@ def _mask(path: Path, session: Session, early: dict[Path, int]) -> None:
     """Mask the serial number; if that fails, remove the recording, so that it cannot be sent by mistake."""
     try:
         if not session.identity:
-            raise InstrumentError("The instrument did not state a serial number")
+            raise InstrumentError("The instrument did not state a serial number", code="recording.mask.no_serial")
         words = words_of(str(session.identity["serial_number"]))
         mask(path, words, early)
         add_note(path, (read_note(path) or {}) | {"masked": True})
         found = _played(path)[2]
         if found:
-            raise InstrumentError(f"The masked recording cannot be replayed ({found[0]})")
+            raise InstrumentError(
+                f"The masked recording cannot be replayed ({found[0]})", code="recording.mask.not_replayed"
+            )
         if holds(path, words):
-            raise InstrumentError("The masked recording still contains the serial number")
+            raise InstrumentError(
+                "The masked recording still contains the serial number", code="recording.mask.serial_left"
+            )
     except InstrumentError as error:
         for each in {path, *parts_of(path)}:
             each.unlink(missing_ok=True)
         raise InstrumentError(
             f"{error}. The recording was removed. Record without --mask-serial, and send the recording only to persons "
-            "who may know the serial number"
+            "who may know the serial number",
+            code=error.code,
         ) from None
 
 
@@ -164,7 +180,9 @@ def _instrument(bench: Path, name: str) -> BenchInstrument:
     found = [each for each in plan.instruments if each.name == name]
     if not found:
         names = ", ".join(each.name for each in plan.instruments)
-        raise BenchError(f"{bench}: expected one of the instruments {names}; found '{name}'")
+        raise BenchError(
+            f"{bench}: expected one of the instruments {names}; found '{name}'", code="bench.instrument.unknown"
+        )
     return found[0]
 
 

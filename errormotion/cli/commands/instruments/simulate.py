@@ -65,14 +65,19 @@ def _simulator_of(plugin_id: str) -> str:
     if plugin_id in found:
         group = found[plugin_id].group
         plugins.get(group, plugin_id)  # raises the reason if the plugin cannot be loaded
-        raise PluginError(f"The {group.rstrip('s')} '{plugin_id}' has no simulator of its own. {choices}")
-    raise PluginError(f"Expected an instrument or a compensator that can be simulated; found '{plugin_id}'. {choices}")
+        raise PluginError(
+            f"The {group.rstrip('s')} '{plugin_id}' has no simulator of its own. {choices}", code="simulator.missing"
+        )
+    raise PluginError(
+        f"Expected an instrument or a compensator that can be simulated; found '{plugin_id}'. {choices}",
+        code="plugin.unknown",
+    )
 
 
 def _pairs(settings: list[str]) -> dict[str, str]:
     pairs = [text.partition("=") for text in settings]
     if wrong := [name for name, mark, value in pairs if not (name and mark and value)]:
-        raise InstrumentError(f"--set {wrong[0]}: expected KEY=VALUE, such as fault_at=10")
+        raise InstrumentError(f"--set {wrong[0]}: expected KEY=VALUE, such as fault_at=10", code="option.form")
     return {name: value for name, _, value in pairs}
 
 
@@ -99,7 +104,8 @@ def _require_reachable(url: str) -> None:
     if url.startswith("can://virtual/"):
         raise InstrumentError(
             f"The simulated device uses a CAN bus inside this process, {url}; choose a bus that other processes reach, "
-            "such as --set bus=udp_multicast"
+            "such as --set bus=udp_multicast",
+            code="simulator.bus.inside",
         )
 
 

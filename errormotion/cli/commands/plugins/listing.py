@@ -8,7 +8,7 @@ from typing import Any
 
 from errormotion import plugins
 from errormotion.campaign.form.written import default_of
-from errormotion.cli.output import show, show_json, table
+from errormotion.cli.output import failure, show, show_json, table
 from errormotion.errors import PluginError
 
 
@@ -73,9 +73,11 @@ def check_plugin(plugin_id: str, address: str | None, mutants: int | None, only:
 
     with claimed([] if address is None else [use_of(address)], "a check of a plugin"):
         results = testing.check_plugin(group_of(plugin_id), plugin_id, address=address, mutants=mutants, only=only)
-    good = all(result.ok for result in results)
+    bad = [f"{result.name}: {result.message}" for result in results if not result.ok]
+    good = not bad
     if as_json:
-        show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results]})
+        error = failure("\n".join(bad), code="plugin.checks.failed") if bad else {}
+        show_json({"ok": good, "plugin": plugin_id, "checks": [asdict(result) for result in results], **error})
         return good
     rows = [["-" if r.skipped else "ok" if r.ok else "FAILED", r.name, f"{r.seconds:.2f}", r.message] for r in results]
     show(table(["", "check", "seconds", "message"], rows))
@@ -91,9 +93,10 @@ def group_of(plugin_id: str) -> plugins.Group:
         return found[0]
     if found:
         raise PluginError(
-            f"'{plugin_id}' is the id of a plugin in each of the groups {' and '.join(found)}; rename one"
+            f"'{plugin_id}' is the id of a plugin in each of the groups {' and '.join(found)}; rename one",
+            code="plugin.ambiguous",
         )
     from errormotion.datasets.files.tomlfile import nearest
 
     names = [plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)]
-    raise PluginError(f"No plugin '{plugin_id}'; {nearest(plugin_id, names)}")
+    raise PluginError(f"No plugin '{plugin_id}'; {nearest(plugin_id, names)}", code="plugin.unknown")

@@ -46,7 +46,9 @@ def new(what: str, name: str, out: Path | None, as_json: bool) -> None:
     }
     folder = out or Path(f"errormotion-{words['dashed']}")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise PluginError(f"{folder}: expected a new or empty folder. Nothing was written.")
+        raise PluginError(
+            f"{folder}: expected a new or empty folder. Nothing was written.", code="plugin.folder.not_empty"
+        )
     written = [_write(folder, path, template, words) for path, template in _templates(TEMPLATES / what, plugin_id)]
     if as_json:
         show_json({"ok": True, "plugin": plugin_id, "folder": str(folder), "files": [str(path) for path in written]})
@@ -66,10 +68,15 @@ def id_of(name: str) -> str:
     """
     found = re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
     if not found.isidentifier() or keyword.iskeyword(found) or len(found) > 40:
-        raise PluginError(f"'{name}': expected a name that starts with a letter, such as 'my sensor'; found '{found}'")
+        raise PluginError(
+            f"'{name}': expected a name that starts with a letter, such as 'my sensor'; found '{found}'",
+            code="plugin.name.form",
+        )
     taken = {plugin.id for group in plugins.GROUPS for plugin in plugins.available(group)}
     if found in taken or found in sys.stdlib_module_names or found == "errormotion":
-        raise PluginError(f"'{found}' is the name of another plugin or package; choose another name")
+        raise PluginError(
+            f"'{found}' is the name of another plugin or package; choose another name", code="plugin.name.used"
+        )
     return found
 
 

@@ -66,7 +66,10 @@ def compare(
     with working(f"Comparing {len(results)} results"):
         found = compared(results, at=at, freedoms=freedoms, since=since, same_start=same_start, groups=groups)
     if stated.over is not None and stated.over not in found["value"].dims:
-        raise DatasetError(f"--over {stated.over}: the results are compared over {_common(found) or 'nothing'}")
+        raise DatasetError(
+            f"--over {stated.over}: the results are compared over {_common(found) or 'nothing'}",
+            code="compare.over.unknown",
+        )
     if left_out:
         found.attrs["notes"] = [*filter(None, found.attrs["notes"]), *left_out]
     if out is not None:
@@ -104,7 +107,8 @@ def _of_one_part(loaded: Loaded, results: dict[str, xr.Dataset]) -> tuple[dict[s
         places = dict.fromkeys(str(loaded.paths[name]) for name in kept if name in loaded.paths)
         raise DatasetError(
             f"The results are of different parts of the machine ({shown}). Compare those of one part: "
-            f"errormotion compare {' '.join(places)}"
+            f"errormotion compare {' '.join(places)}",
+            code="compare.component.differs",
         )
     return {name: results[name] for name in kept}, [
         f"omitted: '{name}', whose component '{results[name].attrs['component']}' differs from that of the others."
@@ -125,7 +129,9 @@ def _named(names: list[str]) -> dict[str, Path]:
     for each in names:
         name, equals, path = each.partition("=")
         if not (name and equals and path):
-            raise DatasetError(f"--name {each}: expected NAME=PATH, as in --name 'five sensors=runs/drift-1'")
+            raise DatasetError(
+                f"--name {each}: expected NAME=PATH, as in --name 'five sensors=runs/drift-1'", code="option.form"
+            )
         found[name] = Path(path)
     return found
 
@@ -137,11 +143,16 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
         name, _, paths = each.partition("=")
         parts = [part for part in paths.split(",") if part]
         if not name or len(parts) != 2:
-            raise DatasetError(f"--change {each}: expected NAME=AFTER,BEFORE, as in --change volume=warm.nc,cold.nc")
+            raise DatasetError(
+                f"--change {each}: expected NAME=AFTER,BEFORE, as in --change volume=warm.nc,cold.nc",
+                code="option.form",
+            )
         both = load([], {"after": Path(parts[0]), "before": Path(parts[1])}).results
         found[name] = both["after"].em.change_from(both["before"])
     if unmatched := [name for name in stated.origins if name not in found]:
-        raise DatasetError(f"--origin {unmatched[0]}: expected the name of a result: {', '.join(found)}")
+        raise DatasetError(
+            f"--origin {unmatched[0]}: expected the name of a result: {', '.join(found)}", code="compare.result.unknown"
+        )
     for name, origin in stated.origins.items():
         found[name] = found[name].assign_attrs(frame_origin=np.array(origin))
     for each in stated.straightness:
@@ -149,7 +160,8 @@ def _completed(results: dict[str, xr.Dataset], stated: Stated) -> dict[str, xr.D
         if name not in found or place not in STRAIGHTNESS_REFERENCES:
             raise DatasetError(
                 f"--straightness {each}: expected NAME={' or NAME='.join(STRAIGHTNESS_REFERENCES)}, with the name of a "
-                f"result: {', '.join(found)}"
+                f"result: {', '.join(found)}",
+                code="option.form",
             )
         found[name] = found[name].assign_attrs({"straightness_reference": place} | found[name].attrs)
     if stated.chain is not None:
@@ -162,17 +174,21 @@ def over_one(name: str, ds: xr.Dataset, stated: Stated) -> xr.Dataset:
     for each in stated.select:
         dim, _, index = each.partition("=")
         if not dim or not re.fullmatch("[0-9]{1,9}", index):
-            raise DatasetError(f"--select {each}: expected DIM=NUMBER, as in --select position=3")
+            raise DatasetError(f"--select {each}: expected DIM=NUMBER, as in --select position=3", code="option.form")
         if dim in ds["EX"].dims:
             if int(index) >= ds.sizes[dim]:
-                raise DatasetError(f"--select {each}: '{name}' has the elements {dim}=0 to {dim}={ds.sizes[dim] - 1}")
+                raise DatasetError(
+                    f"--select {each}: '{name}' has the elements {dim}=0 to {dim}={ds.sizes[dim] - 1}",
+                    code="errors.index.outside",
+                )
             ds = ds.isel({dim: int(index)})
     others = map(str, ds["EX"].dims) if stated.over is not None and len(ds["EX"].dims) > 1 else ()
     for dim in others:
         if dim != stated.over and ds.sizes[dim] > 1:
             raise DatasetError(
                 f"'{name}': its errors depend on {', '.join(map(str, ds['EX'].dims))}; select one {dim}, "
-                f"as in --select {dim}=0 (0 to {ds.sizes[dim] - 1})"
+                f"as in --select {dim}=0 (0 to {ds.sizes[dim] - 1})",
+                code="compare.dims.too_many",
             )
         ds = ds if dim == stated.over else ds.isel({dim: 0})
     return ds

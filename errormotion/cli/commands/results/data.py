@@ -14,7 +14,7 @@ from errormotion import datasets, plugins
 from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
 from errormotion.cli.guard import ERROR, INTERNAL, log_file
 from errormotion.cli.options import read_settings
-from errormotion.cli.output import show, show_json, working
+from errormotion.cli.output import failure, show, show_json, working
 from errormotion.cli.page import new_files
 from errormotion.cli.progress import Bars
 from errormotion.cli.summary import as_printed, figure_table, notes_of
@@ -114,15 +114,17 @@ def _evaluated(
 def _method_of(raw: Path) -> str:
     """Return the id of the method that identifies a raw dataset."""
     if is_runs_folder(raw):
-        raise DatasetError(f"{raw}: is a folder of runs; name the method with --method")
+        raise DatasetError(f"{raw}: is a folder of runs; name the method with --method", code="batch.method.not_stated")
     path = raw_of(raw)
     with reading(path), datasets.load(path) as dataset:
         schema = str(dataset.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)
     if owner is None or not issubclass(owner, plugins.Method):
-        raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}")
+        raise DatasetError(f"{path}: expected a raw dataset of a method; found schema {schema}", code="schema.other")
     if schema in owner.calibrations:
-        raise DatasetError(f"{path}: contains readings for a calibration; use 'errormotion calibrate'")
+        raise DatasetError(
+            f"{path}: contains readings for a calibration; use 'errormotion calibrate'", code="raw.for_calibration"
+        )
     return str(owner.info.id)
 
 
@@ -145,13 +147,15 @@ def _show_outcomes(
             found[outcome.raw] = judge(datasets.load(outcome.errors), limits)
     decisions = [each.plain() for each in found.values()]
     if as_json:
-        keys = ("raw", "errors", "reason", "seconds", "stepped_over")
+        keys = ("raw", "errors", "reason", "code", "seconds", "stepped_over")
         runs: list[dict[str, Any]] = [{key: getattr(outcome, key) for key in keys} for outcome in outcomes]
         for outcome, run in zip(outcomes, runs, strict=True):
             run["conformity"] = found[outcome.raw].plain() if outcome.raw in found else None
             if (evaluation := evaluations.get(outcome.raw)) is not None:
                 run["verdicts"] = evaluation if isinstance(evaluation, str) else monte_carlo.summary(evaluation)
-        show_json({"ok": not failed and not refused, "scheduler": scheduler, "runs": runs})
+        bad = [f"{outcome.raw}: {outcome.reason}" for outcome in failed] + refused
+        error = failure("\n".join(bad), code="batch.failed") if bad else {}
+        show_json({"ok": not bad, "scheduler": scheduler, "runs": runs, **error})
     else:
         stepped_over = sum(outcome.stepped_over for outcome in outcomes)
         made = len(outcomes) - len(failed) - stepped_over

@@ -46,13 +46,16 @@ def export(
         The path is not exactly one result, the ending or a freedom is unknown, or the file already exists.
     """
     if out.suffix.lower() not in FORMS:
-        raise DatasetError(f"{out}: expected a name that ends in {', '.join(FORMS)}")
+        raise DatasetError(f"{out}: expected a name that ends in {', '.join(FORMS)}", code="file.name.ending")
     if out.exists():
-        raise DatasetError(f"{out}: already exists, and is not replaced; give another name")
+        raise DatasetError(f"{out}: already exists, and is not replaced; give another name", code="file.exists")
     found = load([result], {}).results
     if len(found) != 1:
         names = ", ".join(found) or "none"
-        raise DatasetError(f"{result}: expected one result, a run folder or a NetCDF file; found {names}")
+        raise DatasetError(
+            f"{result}: expected one result, a run folder or a NetCDF file; found {names}",
+            code="export.result.ambiguous",
+        )
     (errors,) = found.values()
     with reading(result):
         rows = int(np.prod([errors.sizes[dim] for dim in errors.em.dims]))
@@ -60,7 +63,10 @@ def export(
             errors = errors.em.at(at)
     if out.suffix.lower() in (".nc", ".zarr"):
         if freedoms is not None:
-            raise DatasetError(f"{out}: a dataset contains all freedoms; --freedoms is allowed for .csv and .xlsx only")
+            raise DatasetError(
+                f"{out}: a dataset contains all freedoms; --freedoms is allowed for .csv and .xlsx only",
+                code="export.freedoms.not_allowed",
+            )
         datasets.save(errors, out)
         sheets = []
     else:
@@ -70,7 +76,10 @@ def export(
             with whole(out) as beside:
                 beside.write_bytes(_csv(sheets[0]))
         elif rows > MAX_ROWS:
-            raise DatasetError(f"{out}: a workbook has at most {MAX_ROWS} rows; found {rows}. Write .csv or .nc")
+            raise DatasetError(
+                f"{out}: a workbook has at most {MAX_ROWS} rows; found {rows}. Write .csv or .nc",
+                code="export.rows.too_many",
+            )
         else:
             xlsx.write(sheets, out)
     if as_json:

@@ -9,7 +9,7 @@ import typer
 
 from errormotion.cli import options
 from errormotion.cli.guard import INVALID
-from errormotion.cli.output import show, show_json
+from errormotion.cli.output import failure, show, show_json
 from errormotion.cli.page import page_of
 from errormotion.cli.root import app
 
@@ -100,7 +100,8 @@ def validate(
 
     mistakes = data.validate(file)
     if json_:
-        show_json({"ok": not mistakes, "file": str(file), "violations": mistakes})
+        error = failure("\n".join(mistakes), code="file.violations") if mistakes else {}
+        show_json({"ok": not mistakes, "file": str(file), "violations": mistakes, **error})
     else:
         count = f"{len(mistakes)} violation" + ("s" if len(mistakes) != 1 else "")
         show("\n  - ".join([f"{file}: {count}", *data.alike(mistakes)]) if mistakes else f"{file}: valid")

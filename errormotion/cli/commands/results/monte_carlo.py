@@ -22,14 +22,16 @@ def trials_of(text: str) -> int | None:
     try:
         return int(text)
     except ValueError as error:
-        raise MethodError(f"--monte-carlo: expected 'auto' or a number of trials; found '{text}'") from error
+        raise MethodError(
+            f"--monte-carlo: expected 'auto' or a number of trials; found '{text}'", code="option.form"
+        ) from error
 
 
 def beside(out: Path) -> Path:
     """Return the file of the evaluation of a result; DatasetError if it already exists or has no folder."""
     file = evaluation_file(out)
     if not out.parent.is_dir():
-        raise DatasetError(f"{out.parent}: no such folder, which --out states for the result")
+        raise DatasetError(f"{out.parent}: no such folder, which --out states for the result", code="folder.not_found")
     new_files(None, file)
     return file
 

@@ -47,14 +47,20 @@ def _opened(address: str) -> bool:
 def _page(place: Path) -> Path:
     if place.is_file():
         if place.suffix.lower() not in (".html", ".htm"):
-            raise RunError(f"{place}: expected a run folder, a folder of runs, or a page (.html)")
+            raise RunError(
+                f"{place}: expected a run folder, a folder of runs, or a page (.html)", code="run.folder.not_found"
+            )
         return place
     if not place.is_dir():
-        raise RunError(f"{place}: there is no such folder; expected a run folder or a folder of runs")
+        raise RunError(
+            f"{place}: there is no such folder; expected a run folder or a folder of runs", code="run.folder.not_found"
+        )
     if (place / "run.json").exists():
         page = _inside(place)
         if page is None:
-            raise RunError(f"{place}: has no {PAGE}. Write it with 'errormotion report {place}'")
+            raise RunError(
+                f"{place}: has no {PAGE}. Write it with 'errormotion report {place}'", code="run.page.missing"
+            )
         return page
     from errormotion.record.runs.listing import list_runs
 
@@ -62,7 +68,9 @@ def _page(place: Path) -> Path:
         page = _inside(path)
         if page is not None:
             return page
-    raise RunError(f"{place}: holds no run with a {PAGE}. Write one with 'errormotion report RUN'")
+    raise RunError(
+        f"{place}: holds no run with a {PAGE}. Write one with 'errormotion report RUN'", code="run.page.missing"
+    )
 
 
 def _inside(folder: Path) -> Path | None:

@@ -45,7 +45,10 @@ def history(
     runs = list_runs(paths or [Path("runs")], machine=machine, method=method, test=test)
     if not runs.runs and machine.casefold() not in map(str.casefold, runs.machines):
         message = f"--machine {machine}: no runs found; {nearest(machine, runs.machines)}"
-        raise RunError("\n  - ".join([message, *(f"could not be read: {reason}" for reason in runs.skipped)]))
+        raise RunError(
+            "\n  - ".join([message, *(f"could not be read: {reason}" for reason in runs.skipped)]),
+            code="runs.machine.unknown",
+        )
     found = followed(runs, machine, figure, at)
     if out is not None:
         datasets.save(found, out)

@@ -50,17 +50,24 @@ def check(source: Sequence[str], offsets: Offsets, reader: Reader) -> int:
             if command.line in left:
                 continue
             if move is None:
-                raise ProgramError(f"line {command.line}: LinuxCNC's interpreter moves, but the reader does not")
+                raise ProgramError(
+                    f"line {command.line}: LinuxCNC's interpreter moves, but the reader does not",
+                    code="program.readings.differ",
+                )
             if move.block.line != command.line:
                 raise ProgramError(
-                    f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}"
+                    f"line {move.block.line}: the reader moves; LinuxCNC's interpreter moves at line {command.line}",
+                    code="program.readings.differ",
                 )
             _same(move, command)
             move = None
             count += 1
     rest = move or next(moves, None)
     if rest is not None:
-        raise ProgramError(f"line {rest.block.line}: the reader moves, but LinuxCNC's interpreter does not")
+        raise ProgramError(
+            f"line {rest.block.line}: the reader moves, but LinuxCNC's interpreter does not",
+            code="program.readings.differ",
+        )
     return count
 
 
@@ -94,5 +101,6 @@ def _same(move: Move, command: Command) -> None:
 def _differ(move: Move, command: Command) -> ProgramError:
     return ProgramError(
         f"line {move.block.line} '{move.block.text.strip()[:60]}': read as motion {move.kind} to {move.end}, centre "
-        f"{move.centre}; LinuxCNC's interpreter: {command.name}({command.text})"
+        f"{move.centre}; LinuxCNC's interpreter: {command.name}({command.text})",
+        code="program.readings.differ",
     )

@@ -98,7 +98,7 @@ def commands(
     """
     program = interpreter()
     if program is None:
-        raise ProgramError("LinuxCNC's interpreter (rs274) is not installed")
+        raise ProgramError("LinuxCNC's interpreter (rs274) is not installed", code="program.interpreter.missing")
     lines = [text for _, text in lines_of(source)]
     parameters = None if own else Parameters(lines, offsets)
     scale = UNITS[offsets.unit] if own else _INCH
@@ -135,7 +135,12 @@ def commands(
             for command in _commands(process, own):
                 if parameters is not None and parameters.reads_tool and _leaves_tool(command):
                     where = lines[command.line - 1] if command.line else ""
-                    raise refusal(command.line, where, "T0 or M61 in a program that reads values of the tool")
+                    raise refusal(
+                        command.line,
+                        where,
+                        "T0 or M61 in a program that reads values of the tool",
+                        code="program.tool.unknown",
+                    )
                 yield command
             code = process.wait()
         finally:
@@ -146,7 +151,10 @@ def commands(
             if process.stdout is not None:
                 process.stdout.close()
         if expired.is_set():
-            raise ProgramError(f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: possibly an endless loop")
+            raise ProgramError(
+                f"LinuxCNC's interpreter did not end within {TIME_LIMIT:g} s: possibly an endless loop",
+                code="program.interpreter.endless",
+            )
         if code != 0:
             raise _refused(folder, code, lines, written, parameters)
 
@@ -184,12 +192,18 @@ def _commands(process: subprocess.Popen[bytes], own: bool) -> Iterator[Command]:
     assert process.stdout is not None
     for count, raw in enumerate(process.stdout):
         if count > MAX_COMMANDS:
-            raise ProgramError(f"the program has more than {MAX_COMMANDS} commands: possibly an endless loop")
+            raise ProgramError(
+                f"the program has more than {MAX_COMMANDS} commands: possibly an endless loop",
+                code="program.interpreter.endless",
+            )
         line = raw.decode("latin-1").rstrip("\n")
         found = _COMMAND.match(line)
         if found is None:
             if line.strip():
-                raise ProgramError(f"LinuxCNC's interpreter printed '{line.strip()[:80]}'; expected a command")
+                raise ProgramError(
+                    f"LinuxCNC's interpreter printed '{line.strip()[:80]}'; expected a command",
+                    code="program.interpreter.output",
+                )
             continue
         number = found[1]
         if number == "0" and not own:  # the change to the tool that is unknown
@@ -208,7 +222,7 @@ def _refused(
             line for line in file.read(4096).decode("latin-1").splitlines() if line.strip() and line != "executing"
         ]
     if code < 0:
-        return ProgramError(f"LinuxCNC's interpreter was ended by signal {-code}")
+        return ProgramError(f"LinuxCNC's interpreter was ended by signal {-code}", code="program.interpreter.ended")
     why, where = messages[0] if messages else f"exit code {code}", messages[1] if len(messages) > 1 else ""
     lines = [k for k, text in enumerate(written, 1) if text.strip().lower() == where.strip().lower() and text.strip()]
     if why.startswith(GUARD) and parameters is not None:
@@ -217,8 +231,8 @@ def _refused(
                 return error
     why += " (LinuxCNC's interpreter)"
     if lines:
-        return refusal(lines[0], source[lines[0] - 1], why)
-    return ProgramError(why)
+        return refusal(lines[0], source[lines[0] - 1], why, code="program.interpreter.refused")
+    return ProgramError(why, code="program.interpreter.refused")
 
 
 def own_number(text: str) -> tuple[str, str]:
@@ -234,13 +248,19 @@ def _write_program(source: Iterable[str], folder: Path, deleted: bool | None, be
     for number, text in enumerate(source, 1):
         _, rest = own_number(text)
         if rest.startswith("/") and deleted is None:
-            raise ProgramError(f"line {number}: '/' (block delete): state whether these blocks are skipped")
+            raise ProgramError(
+                f"line {number}: '/' (block delete): state whether these blocks are skipped",
+                code="program.block_delete.not_stated",
+            )
         plain = rest.lstrip("/ \t")
         if plain and plain[0] not in "oO%":
             mark = "/" if rest.startswith("/") else ""
             text = f"{mark}N{number} {plain}"
         if len(text) > MAX_BLOCK:
-            raise ProgramError(f"line {number}: LinuxCNC's interpreter reads {MAX_BLOCK} characters of a line")
+            raise ProgramError(
+                f"line {number}: LinuxCNC's interpreter reads {MAX_BLOCK} characters of a line",
+                code="program.line.too_long",
+            )
         written.append(text)
     first = next((k for k, text in enumerate(written) if text.strip()), 0)
     start = first + 1 if written and written[first].strip() == "%" else 0

@@ -171,7 +171,7 @@ class Expansion:
             return ["M60" if "M60" in self._codes(command) else "M0"]
         handler = self._handlers.get(name)
         if handler is None:
-            raise self._refusal(command, f"{name} cannot be expanded")
+            raise self._refusal(command, f"{name} cannot be expanded", code="program.code.not_supported")
         return handler(command)
 
     def _text(self, command: Command) -> str:
@@ -193,19 +193,20 @@ class Expansion:
                 text = f"N{number} {text}"
         return SourceLine(text, self._line)
 
-    def _refusal(self, command: Command, why: str) -> ProgramError:
+    def _refusal(self, command: Command, why: str, *, code: str) -> ProgramError:
         if command.line:
-            return refusal(command.line, self._source[command.line - 1], why)
-        return ProgramError(f"a control word (O) after line {self._line}: {why}")
+            return refusal(command.line, self._source[command.line - 1], why, code=code)
+        return ProgramError(f"a control word (O) after line {self._line}: {why}", code=code)
 
     def _units(self, command: Command) -> list[str]:
         unit = "inch" if "INCH" in command.text else "mm"
         if "CM" in command.text:
-            raise self._refusal(command, "centimetres")
+            raise self._refusal(command, "centimetres", code="program.unit.unknown")
         if unit == "inch" and self._tolerance < 2 * _DIGIT * UNITS["inch"]:
             raise self._refusal(
                 command,
                 "inches: LinuxCNC's interpreter prints 0.0001 inch; expected a tolerance of at least 2.6 um",
+                code="program.tolerance.too_small",
             )
         ratio = self._frame.scale / UNITS[unit]
         self._frame = replace(self._frame, scale=UNITS[unit])
@@ -227,7 +228,11 @@ class Expansion:
             if not has_value or abs(value - old / scale) <= 1.5 * _DIGIT:
                 continue
             if stated.get("L") and float(stated["L"]) == 20 and not self._known[axis]:
-                raise self._refusal(command, "an origin at a position that is unknown before the program runs")
+                raise self._refusal(
+                    command,
+                    "an origin at a position that is unknown before the program runs",
+                    code="program.origin.unknown",
+                )
             words += f" {'XYZ'[axis]}{value:.4f}"
             known[axis] = value * scale
         blocks = [f"G10 L2 P{k + 1}{words}"] if words else []
@@ -260,7 +265,9 @@ class Expansion:
             return ["G92 " + " ".join(f"{'XYZ'[k]}{self._at[k]:.4f}" for k in axes)]
         if same:
             return []
-        raise self._refusal(command, "an offset (G92) that no line of the program states")
+        raise self._refusal(
+            command, "an offset (G92) that no line of the program states", code="program.offset.not_stated"
+        )
 
     def _tool(self, command: Command) -> list[str]:
         x, y, z = self._three(command, command.numbers())
@@ -283,7 +290,7 @@ class Expansion:
     def _three(self, command: Command, numbers: Sequence[float]) -> Triple:
         """Return the first three of the numbers of nine axes; the others are 0."""
         if any(numbers[3:9]):
-            raise self._refusal(command, "another axis than X, Y, Z")
+            raise self._refusal(command, "another axis than X, Y, Z", code="program.axis.not_supported")
         return numbers[0], numbers[1], numbers[2]
 
     def _change(self, frame: Frame) -> None:
@@ -296,12 +303,12 @@ class Expansion:
     def _spindle(self, command: Command) -> list[float]:
         numbers = command.numbers()
         if numbers[0] != 0:
-            raise self._refusal(command, "a second spindle")
+            raise self._refusal(command, "a second spindle", code="program.spindle.not_supported")
         return numbers
 
     def _spindle_mode(self, command: Command) -> list[str]:
         if self._spindle(command)[1]:
-            raise self._refusal(command, "constant surface speed (G96)")
+            raise self._refusal(command, "constant surface speed (G96)", code="program.speed.not_supported")
         return []
 
     def _control(self, command: Command) -> list[str]:
@@ -333,15 +340,25 @@ class Expansion:
         unknown until it is moved to a stated position.
         """
         if any(not abs(value) * self._frame.scale <= _FAR for value in new):
-            raise self._refusal(command, "moves too far: the size of the tool or another value is unknown")
+            raise self._refusal(
+                command, "moves too far: the size of the tool or another value is unknown", code="program.move.too_far"
+            )
         stated: dict[str, str] = {}
         if not all(self._known):
             stated = self._stated(command)
             a, b, c = PLANES[self._plane]
             if not self._known[c] and _CYCLES & self._codes(command):
-                raise self._refusal(command, f"a canned cycle while the position of {'XYZ'[c]} is unknown")
+                raise self._refusal(
+                    command,
+                    f"a canned cycle while the position of {'XYZ'[c]} is unknown",
+                    code="program.cycle.unknown_position",
+                )
             if not (self._known[a] and self._known[b]) and command.line in self._compensated:
-                raise self._refusal(command, "cutter compensation that starts at an unknown position")
+                raise self._refusal(
+                    command,
+                    "cutter compensation that starts at an unknown position",
+                    code="program.cutter.unknown_position",
+                )
         words = []
         for k, axis in enumerate("XYZ"):
             if self._known[k]:
@@ -349,11 +366,13 @@ class Expansion:
                     words.append(f"{axis}{new[k]:.4f}")
             elif axis in stated:
                 if self._incremental:
-                    raise self._refusal(command, f"an increment of {axis} from an unknown position")
+                    raise self._refusal(
+                        command, f"an increment of {axis} from an unknown position", code="program.position.unknown"
+                    )
                 self._known[k] = True
                 words.append(f"{axis}{new[k]:.4f}")
             elif abs(new[k] - self._at[k]) > _DIGIT:
-                raise self._refusal(command, f"{axis} moves from an unknown position")
+                raise self._refusal(command, f"{axis} moves from an unknown position", code="program.position.unknown")
         self._at = new
         return " ".join(words)
 
@@ -368,13 +387,17 @@ class Expansion:
     def _in_machine(self, command: Command, new: Triple, code: str) -> list[str]:
         """Return the block of G53, G28 or G30, a move to a position in machine coordinates."""
         if self._frame.rotation:
-            raise self._refusal(command, "a position in machine coordinates with a rotated work offset")
+            raise self._refusal(
+                command, "a position in machine coordinates with a rotated work offset", code="program.machine.rotated"
+            )
         stated = self._stated(command)
         axes = [k for k in range(3) if "XYZ"[k] in stated]
         if code != "G53":
             return self._home(new, code, axes)
         if any(v != v for v in self._systems[self._system]):
-            raise self._refusal(command, "a position in machine coordinates with an unknown work offset")
+            raise self._refusal(
+                command, "a position in machine coordinates with an unknown work offset", code="program.origin.unknown"
+            )
         place = self._frame.machine(new)
         for k in axes:
             self._known[k] = True
@@ -401,7 +424,9 @@ class Expansion:
     def _probe(self, command: Command) -> list[str]:
         found = self._codes(command) & {"G38.2", "G38.3", "G38.4", "G38.5"}
         if not found:
-            raise self._refusal(command, "a probing move that no line of the program states")
+            raise self._refusal(
+                command, "a probing move that no line of the program states", code="program.probing.not_stated"
+            )
         words = self._place(command, self._three(command, command.numbers()))
         for word in words.split():
             self._known["XYZ".index(word[0])] = False
@@ -415,7 +440,7 @@ class Expansion:
         place[a], place[b], place[c] = first, second, third
         at = self._at
         if not (self._known[a] and self._known[b]):
-            raise self._refusal(command, "an arc from an unknown position")
+            raise self._refusal(command, "an arc from an unknown position", code="program.position.unknown")
         words = self._place(command, _triple(place))
         words += f" {'IJK'[a]}{x - at[a]:.4f} {'IJK'[b]}{y - at[b]:.4f}"
         words += f" P{abs(turns):.0f}" if abs(turns) > 1 else ""

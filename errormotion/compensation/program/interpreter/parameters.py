@@ -96,7 +96,7 @@ class Parameters:
 
     def __init__(self, source: Sequence[str], offsets: Offsets) -> None:
         if UNKNOWN_TOOL in offsets.tools:
-            raise ProgramError(f"tool {UNKNOWN_TOOL}: expected another number of a tool")
+            raise ProgramError(f"tool {UNKNOWN_TOOL}: expected another number of a tool", code="program.tool.number")
         self._source, self._offsets = source, offsets
         self._scale = "*25.4" if offsets.unit == "mm" else ""
         self._guarded: dict[int, list[str]] = {}
@@ -146,7 +146,12 @@ class Parameters:
         if not names:
             return None
         what = " or ".join(dict.fromkeys(names))
-        return refusal(line, self._source[line - 1], f"reads {what}, which neither the inputs nor the program state")
+        return refusal(
+            line,
+            self._source[line - 1],
+            f"reads {what}, which neither the inputs nor the program state",
+            code="program.parameter.unknown",
+        )
 
     def _note(self, plain: str, scope: _Scope) -> None:
         """Add what a line sets."""
@@ -175,7 +180,12 @@ class Parameters:
             if _DEBUG.match(comment[0]):
                 for found in _IN_COMMENT.finditer(_squeezed(comment[0])):
                     if self._value(number, text, found[0], scope) != found[0]:
-                        raise refusal(number, text, f"shows {found[0]}, which is unknown before the program runs")
+                        raise refusal(
+                            number,
+                            text,
+                            f"shows {found[0]}, which is unknown before the program runs",
+                            code="program.prints_unknown",
+                        )
         code = _code(text)
         compensates = _COMPENSATES.search(code) and not _RADIUS.search(code)
         if "#" not in code and not compensates and not _NO_TOOL.search(code):
@@ -194,7 +204,12 @@ class Parameters:
             at = end
         new = "".join(pieces)
         if len(new) > max(len(text), MAX_BLOCK - 10):
-            raise refusal(number, text, "too many parameters in one line to check that the program sets all of them")
+            raise refusal(
+                number,
+                text,
+                "too many parameters in one line to check that the program sets all of them",
+                code="program.parameters.too_many",
+            )
         return new
 
     def _rewritten(self, number: int, text: str, code: str, scope: _Scope) -> str:
@@ -204,7 +219,7 @@ class Parameters:
             new += code[k:start]
             end = _operand(code, start + 1)
             if end < 0:
-                raise refusal(number, text, "expected a parameter after #")
+                raise refusal(number, text, "expected a parameter after #", code="program.parameter.form")
             reference, operand = code[start:end], code[start + 1 : end]
             k = end
             if code[end : end + 1] == "=":
@@ -226,7 +241,7 @@ class Parameters:
             return f"#{operand}"
         if _direct(operand):
             if float(operand) > 5000:
-                raise refusal(number, text, "sets a parameter of the control")
+                raise refusal(number, text, "sets a parameter of the control", code="program.parameter.of_control")
             return f"#{operand}"
         inner = self._rewritten(number, text, operand, scope)
         self._guarded.setdefault(number, []).append("or sets a parameter of the control with a computed number")
@@ -235,7 +250,12 @@ class Parameters:
     def _exists(self, number: int, text: str, operand: str, scope: _Scope) -> None:
         name = operand[1:-1]
         if name.startswith("_") and name not in scope.names:
-            raise refusal(number, text, f"whether #<{name}> exists depends on the programs that ran before")
+            raise refusal(
+                number,
+                text,
+                f"whether #<{name}> exists depends on the programs that ran before",
+                code="program.parameter.may_exist",
+            )
 
     def _value(self, number: int, text: str, reference: str, scope: _Scope) -> str:
         """Return the expression that replaces a reference to a parameter with a stated number or name."""
@@ -244,7 +264,7 @@ class Parameters:
             return self._named(number, text, operand[1:-1], scope)
         index = round(float(operand))
         if abs(index - float(operand)) > 1e-4 or index < 1:
-            raise refusal(number, text, f"#{operand} is not a parameter")
+            raise refusal(number, text, f"#{operand} is not a parameter", code="program.parameter.form")
         if index <= 5000:
             if index in scope.numbers:
                 return reference
@@ -271,18 +291,34 @@ class Parameters:
                 text,
                 f"reads {reference}, which depends on what the control did before; expected one of "
                 f"{', '.join(sorted(codes)).upper()} before it",
+                code="program.parameter.of_earlier",
             )
         if name in self._assigned:
             return reference
         if re.match(r"_(hal\[|[xyzabcuvw]$|abs_)", name):
-            raise refusal(number, text, f"reads {reference}, a parameter that the running machine sets")
-        raise refusal(number, text, f"reads {reference}, which neither the inputs nor the program state")
+            raise refusal(
+                number,
+                text,
+                f"reads {reference}, a parameter that the running machine sets",
+                code="program.parameter.of_control",
+            )
+        raise refusal(
+            number,
+            text,
+            f"reads {reference}, which neither the inputs nor the program state",
+            code="program.parameter.unknown",
+        )
 
     def _of_control(self, number: int, text: str, index: int) -> str:
         """Return the expression for a parameter above 5000, in units of the machine."""
         offsets, reference = self._offsets, f"#{index}"
         if index in _OF_MACHINE:
-            raise refusal(number, text, "a parameter that the running machine sets (position, probe, input)")
+            raise refusal(
+                number,
+                text,
+                "a parameter that the running machine sets (position, probe, input)",
+                code="program.parameter.of_control",
+            )
         if index in _TOOL:
             self.reads_tool = True
             value = reference + (self._scale if index in _TOOL_SCALED else "")
@@ -298,7 +334,12 @@ class Parameters:
             axis = index - 5211
             stated = float(offsets.stored[axis]) * length if axis < 3 else stated
             if self._sets_g92 or (axis > 2 and self._changes_g92):
-                raise refusal(number, text, f"reads {reference}, which G92 sets at a position that may be unknown")
+                raise refusal(
+                    number,
+                    text,
+                    f"reads {reference}, which G92 sets at a position that may be unknown",
+                    code="program.parameter.of_position",
+                )
             native, literal = axis < 3, axis > 2
         elif index in (5210, 5220):
             native = True
@@ -306,13 +347,26 @@ class Parameters:
             axis, system = (index - 5221) % 20, (index - 5221) // 20
             stated = float(offsets.systems[system, axis]) * length if axis < 3 else stated
             if self._sets_origins:
-                raise refusal(number, text, f"reads {reference}, which G10 L20 sets at a position that may be unknown")
+                raise refusal(
+                    number,
+                    text,
+                    f"reads {reference}, which G10 L20 sets at a position that may be unknown",
+                    code="program.parameter.of_position",
+                )
             native, literal = axis < 3 or axis == 9, 3 <= axis < 9
         else:
-            raise refusal(number, text, f"reads {reference}, whose value is not known before the program runs")
+            raise refusal(
+                number,
+                text,
+                f"reads {reference}, whose value is not known before the program runs",
+                code="program.parameter.unknown",
+            )
         if stated != stated:
             raise refusal(
-                number, text, f"reads {reference}, which is not stated: state --parameters FILE.var with this parameter"
+                number,
+                text,
+                f"reads {reference}, which is not stated: state --parameters FILE.var with this parameter",
+                code="program.parameter.not_stated",
             )
         if literal:
             return f"[{stated:.9f}]"

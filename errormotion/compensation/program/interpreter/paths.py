@@ -171,7 +171,7 @@ def compare(
         states = found
     if not any(reached and all(cut.length() <= bound for cut in old[k + 1 :]) for k, reached in states):
         expected = old[min(max(k + reached for k, reached in states), len(old) - 1)]
-        raise ProgramError(f"{_shown(expected)}; the new program does not make this cut")
+        raise ProgramError(f"{_shown(expected)}; the new program does not make this cut", code="program.cut.differs")
     return len(old)
 
 
@@ -242,7 +242,8 @@ def _from_segment(p: Triple, s: Triple, e: Triple, before: float) -> float:
 def _differ(expected: Cut | None, cut: Cut, place: Triple) -> ProgramError:
     where = f"the new program cuts to {_millimetres(place)} in line {cut.line}"
     return ProgramError(
-        f"{_shown(expected)}; {where}" if expected is not None else f"{where}, the original does not cut"
+        f"{_shown(expected)}; {where}" if expected is not None else f"{where}, the original does not cut",
+        code="program.cut.differs",
     )
 
 

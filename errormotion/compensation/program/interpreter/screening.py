@@ -31,7 +31,12 @@ def screen(source: Iterable[str]) -> None:
     for line, text in enumerate(source, 1):
         for comment in COMMENT.finditer(text):
             if _LOST.match(comment[0]):
-                raise refusal(line, text, "prints or logs values, which are unknown before the program runs")
+                raise refusal(
+                    line,
+                    text,
+                    "prints or logs values, which are unknown before the program runs",
+                    code="program.prints_unknown",
+                )
         if not _CONTROL.match(COMMENT.sub(" ", text)):
             _check_codes(line, text)
 
@@ -40,11 +45,11 @@ def _check_codes(line: int, text: str) -> None:
     for code in codes_of(text):
         letter, number = code[0], code[1:]
         if not number:
-            raise refusal(line, text, f"a computed code ({letter})")
+            raise refusal(line, text, f"a computed code ({letter})", code="program.code.computed")
         if float(number) not in (_G if letter == "G" else _M):
-            raise refusal(line, text, f"{code} cannot be expanded")
+            raise refusal(line, text, f"{code} cannot be expanded", code="program.code.not_supported")
         if code == "G10" and not {float(number) for letter, number in words_of(text) if letter == "L" and number} & {
             2,
             20,
         }:
-            raise refusal(line, text, "expected G10 L2 or L20")
+            raise refusal(line, text, "expected G10 L2 or L20", code="program.g10.form")

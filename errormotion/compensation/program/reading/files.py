@@ -24,9 +24,11 @@ def text_of(path: Path) -> str:
     """
     try:
         if require_regular(path).st_size > MAX_FILE:
-            raise ProgramError(f"{path}: expected a file of at most {MAX_FILE} bytes")
+            raise ProgramError(f"{path}: expected a file of at most {MAX_FILE} bytes", code="program.too_long")
         return path.read_bytes().decode("utf-8")
     except OSError as error:
-        raise ProgramError(f"{path} cannot be read: {error.strerror}") from None
+        raise ProgramError(f"{path} cannot be read: {error.strerror}", code="program.file.unreadable") from None
     except UnicodeDecodeError as error:
-        raise ProgramError(f"{path}: expected text; found other bytes at {error.start}") from None
+        raise ProgramError(
+            f"{path}: expected text; found other bytes at {error.start}", code="program.file.no_text"
+        ) from None

@@ -79,7 +79,7 @@ class Offsets:
     def with_system(self, name: str, origin: tuple[float, float, float]) -> Offsets:
         """Return the offsets with another origin of one system, m."""
         if name.upper() not in SYSTEMS:
-            raise ProgramError(f"offset of '{name}': expected one of {', '.join(SYSTEMS)}")
+            raise ProgramError(f"offset of '{name}': expected one of {', '.join(SYSTEMS)}", code="program.offset.name")
         systems = self.systems.copy()
         systems[SYSTEMS.index(name.upper())] = origin
         return replace(self, systems=systems)
@@ -117,15 +117,22 @@ def read_parameters(path: Path, unit: str = "mm") -> Offsets:
             continue
         found = _LINE.match(line)
         if found is None:
-            raise ProgramError(f"{path}, line {number}: expected a number and a value; found '{line[:40]}'")
+            raise ProgramError(
+                f"{path}, line {number}: expected a number and a value; found '{line[:40]}'",
+                code="program.parameters.form",
+            )
         key, value = int(found[1]), float(found[2])
         if not 0 < key <= LAST_PARAMETER or key in values:
             raise ProgramError(
                 f"{path}, line {number}: expected a parameter from 1 to {LAST_PARAMETER} that no other line states; "
-                f"found {key}"
+                f"found {key}",
+                code="program.parameters.number",
             )
         if not math.isfinite(value):
-            raise ProgramError(f"{path}, line {number}: expected a finite value; found '{found[2][:40]}'")
+            raise ProgramError(
+                f"{path}, line {number}: expected a finite value; found '{found[2][:40]}'",
+                code="program.parameters.value",
+            )
         values[key] = value
 
     def three(first: int) -> list[float]:
@@ -134,7 +141,10 @@ def read_parameters(path: Path, unit: str = "mm") -> Offsets:
     starts = [_FIRST + 20 * k for k in range(len(SYSTEMS))]
     active = values.get(5220, 1.0)
     if active not in range(1, len(SYSTEMS) + 1):
-        raise ProgramError(f"{path}, parameter 5220: expected a coordinate system from 1 to 9; found {active:g}")
+        raise ProgramError(
+            f"{path}, parameter 5220: expected a coordinate system from 1 to 9; found {active:g}",
+            code="program.parameters.system",
+        )
     return Offsets(
         systems=np.array([three(start) for start in starts]),
         rotations=np.array([values.get(start + 9, 0.0) for start in starts]),

@@ -111,7 +111,12 @@ class Reader:
     def _item(self, block: Block) -> Item:
         if block.skippable:
             if self.deleted is None:
-                raise refusal(block.line, block.text, "'/' (block delete): state whether these blocks are skipped")
+                raise refusal(
+                    block.line,
+                    block.text,
+                    "'/' (block delete): state whether these blocks are skipped",
+                    code="program.block_delete.not_stated",
+                )
             if self.deleted:
                 return Text(block.text)
             block = split(block.line, block.text.replace("/", "", 1))
@@ -124,7 +129,7 @@ class Reader:
             elif letter == "M":
                 switches.append(int(_whole(block, letter, number)))
             elif letter in values:
-                raise refusal(block.line, block.text, f"the word {letter} is repeated")
+                raise refusal(block.line, block.text, f"the word {letter} is repeated", code="program.word.repeated")
             else:
                 values[letter] = number
         if codes or switches or "S" in values or "T" in values:
@@ -134,7 +139,12 @@ class Reader:
         if "X" in values or "Y" in values or "Z" in values or "I" in values or "J" in values or "K" in values:
             return self._move(block, values, explicit=False, machine=False)
         if values.keys() - {"N", "F"}:
-            raise refusal(block.line, block.text, f"the word {min(values.keys() - {'N', 'F'})} is not allowed here")
+            raise refusal(
+                block.line,
+                block.text,
+                f"the word {min(values.keys() - {'N', 'F'})} is not allowed here",
+                code="program.word.not_allowed",
+            )
         return Text(block.text)
 
     def _full(self, block: Block, codes: list[int], switches: list[int], values: dict[str, str]) -> Item:
@@ -145,11 +155,16 @@ class Reader:
         for code in codes:
             if code in _MOTIONS:
                 if motion is not None:
-                    raise refusal(block.line, block.text, "two motions in one block")
+                    raise refusal(block.line, block.text, "two motions in one block", code="program.block.two_motions")
                 motion = _MOTIONS[code]
             elif code in _CONSUMERS:
                 if consumer is not None:
-                    raise refusal(block.line, block.text, "two codes that use the axis words in one block")
+                    raise refusal(
+                        block.line,
+                        block.text,
+                        "two codes that use the axis words in one block",
+                        code="program.block.axis_words",
+                    )
                 consumer = code
             elif code == 530:
                 machine = True
@@ -171,24 +186,38 @@ class Reader:
             self._motion = motion
         if consumer is not None:
             if motion is not None and set(values) & set("XYZIJK"):
-                raise refusal(block.line, block.text, "a motion, and another code that uses its axis words")
+                raise refusal(
+                    block.line,
+                    block.text,
+                    "a motion, and another code that uses its axis words",
+                    code="program.block.axis_words",
+                )
             item = self._consume(block, consumer, values)
         elif set(values) & set("XYZ") or (set(values) & set("IJK") and 430 not in codes):
             item = self._move(block, values, explicit=motion is not None, machine=machine)
             allowed = _OWN | (set("IJKRP") if item_is_arc(item) else set()) | (_OF_SWITCHES if switches else set())
             allowed |= {"H"} if 430 in codes else set()
             if item_is_arc(item) and switches and (("P" in values and _WITH_P & {*switches}) or 19 in switches):
-                raise refusal(block.line, block.text, "an arc and a switch that share a word (P or R)")
+                raise refusal(
+                    block.line,
+                    block.text,
+                    "an arc and a switch that share a word (P or R)",
+                    code="program.block.shared_word",
+                )
             if more := values.keys() - allowed:
-                raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
+                raise refusal(
+                    block.line, block.text, f"the word {min(more)} is not allowed here", code="program.word.not_allowed"
+                )
         else:
             if machine:
-                raise refusal(block.line, block.text, "G53 without a position")
+                raise refusal(block.line, block.text, "G53 without a position", code="program.machine.no_position")
             known = {"N", "F", "S", "T"} | ({"H"} if 430 in codes else set()) | (_OF_SWITCHES if switches else set())
             known |= {"P", "Q"} if 640 in later else set()
             known |= {"D"} if 960 in later else set()
             if more := values.keys() - known:
-                raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
+                raise refusal(
+                    block.line, block.text, f"the word {min(more)} is not allowed here", code="program.word.not_allowed"
+                )
             item = Text(block.text, motion)
         if any(code in _ENDS for code in switches):
             self.ended = True
@@ -197,12 +226,19 @@ class Reader:
     def _switch(self, block: Block, code: int, values: dict[str, str]) -> None:
         if code == 6:
             if self._waiting is None:
-                raise refusal(block.line, block.text, "M6 before a tool was selected (T)")
+                raise refusal(
+                    block.line, block.text, "M6 before a tool was selected (T)", code="program.tool.not_selected"
+                )
             self._tool = self._waiting
         elif code == 61:
             self._tool = int(_whole(block, "Q", values.get("Q", "")))
         elif code not in _SWITCHES and code not in _STOPS and code not in _ENDS:
-            raise refusal(block.line, block.text, f"M{code} is not supported by the plain reader")
+            raise refusal(
+                block.line,
+                block.text,
+                f"M{code} is not supported by the plain reader",
+                code="program.code.not_supported",
+            )
 
     def _modal(self, block: Block, code: int, values: dict[str, str]) -> None:
         """Change the modal state."""
@@ -224,11 +260,26 @@ class Reader:
         elif code == 490:
             self._change(replace(self._frame, tool=(0.0, 0.0, 0.0)))
         elif code in _CYCLES:
-            raise refusal(block.line, block.text, f"G{code // 10} is a canned cycle, not supported by the plain reader")
+            raise refusal(
+                block.line,
+                block.text,
+                f"G{code // 10} is a canned cycle, not supported by the plain reader",
+                code="program.cycle.not_supported",
+            )
         elif code in (410, 411, 420, 421):
-            raise refusal(block.line, block.text, f"G{code / 10:g} (cutter compensation) changes the path")
+            raise refusal(
+                block.line,
+                block.text,
+                f"G{code / 10:g} (cutter compensation) changes the path",
+                code="program.cutter.not_supported",
+            )
         elif code not in _HARMLESS and code not in _PATH:
-            raise refusal(block.line, block.text, f"G{code / 10:g} is not supported by the plain reader")
+            raise refusal(
+                block.line,
+                block.text,
+                f"G{code / 10:g} is not supported by the plain reader",
+                code="program.code.not_supported",
+            )
         if code == 800:
             self._motion = None
 
@@ -246,7 +297,12 @@ class Reader:
             allowed |= set(_AXES)
             item = self._home(block, 0 if code == 280 else 1, values)
         elif code in (281, 301):
-            raise refusal(block.line, block.text, "stores a position that is unknown before the program runs")
+            raise refusal(
+                block.line,
+                block.text,
+                "stores a position that is unknown before the program runs",
+                code="program.position.stored_unknown",
+            )
         elif code == 431:
             allowed |= set(_AXES)
             tool = list(self._frame.tool)
@@ -259,7 +315,9 @@ class Reader:
             allowed |= set(_AXES)
             axes = _axes(values)
             if not axes:
-                raise refusal(block.line, block.text, "a probing move without a position")
+                raise refusal(
+                    block.line, block.text, "a probing move without a position", code="program.probing.no_position"
+                )
             self._forget(axes, f"the probing move of line {block.line} ends at the contact")
             self._motion = None
             item = Unchanged(block.text, block.line, axes, -1, True, "probe")
@@ -269,7 +327,7 @@ class Reader:
             at, g92 = list(self._at), list(frame.g92)
             axes = _axes(values)
             if not axes:
-                raise refusal(block.line, block.text, "G92 without a position")
+                raise refusal(block.line, block.text, "G92 without a position", code="program.offset.no_position")
             for k in axes:
                 value = _number(block, _AXES[k], values[_AXES[k]])
                 g92[k] += (at[k] - value) * frame.scale
@@ -289,18 +347,22 @@ class Reader:
             self._change(replace(self._frame, g92=self._stored if code == 923 else (0.0, 0.0, 0.0)))
             item = Text(block.text)
         if more := values.keys() - allowed:
-            raise refusal(block.line, block.text, f"the word {min(more)} is not allowed here")
+            raise refusal(
+                block.line, block.text, f"the word {min(more)} is not allowed here", code="program.word.not_allowed"
+            )
         return item
 
     def _set_system(self, block: Block, values: dict[str, str]) -> Item:
         kind = values.get("L", "")
         number = int(_whole(block, "P", values.get("P", ""))) or self._system + 1
         if kind not in ("2", "20") or not 1 <= number <= len(SYSTEMS):
-            raise refusal(block.line, block.text, "expected G10 L2 or L20, with P0 to P9")
+            raise refusal(block.line, block.text, "expected G10 L2 or L20, with P0 to P9", code="program.g10.form")
         index = number - 1
         scale = self._frame.scale
         if kind == "20" and ("R" in values or self._rotations[index] or self._frame.rotation):
-            raise refusal(block.line, block.text, "G10 L20 with a rotated coordinate system")
+            raise refusal(
+                block.line, block.text, "G10 L20 with a rotated coordinate system", code="program.g10.rotated"
+            )
         for k in _axes(values):
             value = _number(block, _AXES[k], values[_AXES[k]]) * scale
             self._systems[index, k] = (
@@ -334,7 +396,9 @@ class Reader:
     def _move(self, block: Block, values: dict[str, str], *, explicit: bool, machine: bool) -> Item:
         motion = self._motion
         if motion is None:
-            raise refusal(block.line, block.text, "a position without a motion (G0 to G3)")
+            raise refusal(
+                block.line, block.text, "a position without a motion (G0 to G3)", code="program.motion.missing"
+            )
         if machine:
             return self._in_machine(block, values, motion, explicit)
         at = self._at
@@ -349,7 +413,7 @@ class Reader:
         frame = self._frame
         centre, sweep = (0.0, 0.0), 0.0
         if motion <= LINE and ("I" in values or "J" in values or "K" in values or "R" in values):
-            raise refusal(block.line, block.text, "I, J, K or R without an arc (G2, G3)")
+            raise refusal(block.line, block.text, "I, J, K or R without an arc (G2, G3)", code="program.arc.missing")
         known = frame.known and _known(new)
         if not known and motion == RAPID:
             self._at = new
@@ -361,9 +425,14 @@ class Reader:
             if known and motion == RAPID:
                 at = new  # from an unknown position: only the end is relevant
             else:
-                raise refusal(block.line, block.text, f"a cut from or to an unknown position: {self._unknown()}")
+                raise refusal(
+                    block.line,
+                    block.text,
+                    f"a cut from or to an unknown position: {self._unknown()}",
+                    code="program.position.unknown",
+                )
         if motion == LINE and self._feed_mode == 93 and "F" not in values:
-            raise refusal(block.line, block.text, "G93 without F")
+            raise refusal(block.line, block.text, "G93 without F", code="program.feed.missing")
         if motion > LINE:
             centre, sweep = arcs.arc(block, values, at, new, PLANES[self._plane], motion, self._centre_absolute)
         self._at = new
@@ -387,7 +456,7 @@ class Reader:
     def _in_machine(self, block: Block, values: dict[str, str], motion: int, explicit: bool) -> Item:
         """Return the unchanged rapid move of G53 to a position in machine coordinates."""
         if motion != RAPID or not self._absolute:
-            raise refusal(block.line, block.text, "G53 is supported with G0 and G90 only")
+            raise refusal(block.line, block.text, "G53 is supported with G0 and G90 only", code="program.machine.mode")
         machine = list(self._frame.machine(self._at))
         axes = _axes(values)
         for k in axes:
@@ -396,7 +465,12 @@ class Reader:
         if not self._frame.rotation:
             new = _triple([new[k] if k in axes else self._at[k] for k in range(3)])
         elif not {0, 1} <= set(axes) and axes != (2,):
-            raise refusal(block.line, block.text, "G53 in a rotated coordinate system: expected both X and Y, or Z")
+            raise refusal(
+                block.line,
+                block.text,
+                "G53 in a rotated coordinate system: expected both X and Y, or Z",
+                code="program.machine.rotated",
+            )
         self._at = new
         return Unchanged(block.text, block.line, axes, motion, explicit, "machine")
 
@@ -406,7 +480,12 @@ class Reader:
             return 0.0, 0.0, 0.0
         if number is None or number not in self._offsets.tools:
             which = "the tool in the spindle" if number is None else f"tool {number}"
-            raise refusal(block.line, block.text, f"the length of {which} is unknown: state a tool table with --tools")
+            raise refusal(
+                block.line,
+                block.text,
+                f"the length of {which} is unknown: state a tool table with --tools",
+                code="program.tool.length_unknown",
+            )
         return _triple(self._offsets.tools[number])
 
     def _origin(self) -> Triple:
@@ -453,7 +532,7 @@ def _code(block: Block, number: str) -> int:
         value = 10 * float(number)
         found = round(value)
         if abs(value - found) > 1e-6 or not 0 <= found < 1000:
-            raise refusal(block.line, block.text, f"G{number} is not a code")
+            raise refusal(block.line, block.text, f"G{number} is not a code", code="program.code.unknown")
         if len(_CODES) < 1000:
             _CODES[number] = found
     return found
@@ -461,21 +540,25 @@ def _code(block: Block, number: str) -> int:
 
 def _number(block: Block, letter: str, text: str) -> float:
     if not text:
-        raise refusal(block.line, block.text, f"expected the word {letter}")
+        raise refusal(block.line, block.text, f"expected the word {letter}", code="program.word.missing")
     return float(text)
 
 
 def _positive(block: Block, letter: str, text: str) -> float:
     value = float(text)
     if value < 0:
-        raise refusal(block.line, block.text, f"expected {letter} not below 0; found {text}")
+        raise refusal(
+            block.line, block.text, f"expected {letter} not below 0; found {text}", code="program.word.negative"
+        )
     return value
 
 
 def _whole(block: Block, letter: str, text: str) -> float:
     value = _number(block, letter, text)
     if value != int(value) or not 0 <= value < 1 << 31:
-        raise refusal(block.line, block.text, f"expected a whole number at {letter}; found {text}")
+        raise refusal(
+            block.line, block.text, f"expected a whole number at {letter}; found {text}", code="program.word.not_whole"
+        )
     return value
 
 

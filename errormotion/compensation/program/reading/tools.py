@@ -114,7 +114,10 @@ def read_table(path: Path, unit: str = "mm") -> Table:
         if "T" not in values or len(line) >= MAX_ENTRY:
             raise _unread(path, number, line)
         if any(not math.isfinite(value) for value in values.values()):
-            raise ProgramError(f"{path}, line {number}: expected finite numbers; found '{line.strip()[:_SHOWN]}'")
+            raise ProgramError(
+                f"{path}, line {number}: expected finite numbers; found '{line.strip()[:_SHOWN]}'",
+                code="program.tools.form",
+            )
         for letter, rest in words.items():
             if not _WORD.fullmatch(letter + rest.strip()):
                 notes.append(
@@ -166,5 +169,6 @@ def _number(path: Path, number: int, line: str, letter: str, text: str) -> float
 def _unread(path: Path, number: int, line: str) -> ProgramError:
     return ProgramError(
         f"{path}, line {number}: expected a tool, such as 'T1 P1 Z80.25', with spaces between the words; found "
-        f"'{line.strip()[:_SHOWN]}'"
+        f"'{line.strip()[:_SHOWN]}'",
+        code="program.tools.form",
     )

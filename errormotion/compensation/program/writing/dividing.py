@@ -90,7 +90,9 @@ class _Field:
             if not values.valid.all():
                 self.valid[k[~values.valid]] = False
         if not np.isfinite(found).all():
-            raise ProgramError("the correction is unknown at some positions of the program")
+            raise ProgramError(
+                "the correction is unknown at some positions of the program", code="program.correction.unknown"
+            )
         return found
 
 
@@ -141,7 +143,8 @@ def _bounded(counts: Indices, most: int) -> None:
     if counts.size and counts.max() > most:
         raise ProgramError(
             f"a move requires {counts.max()} points, of which at most {most} are allowed: "
-            "increase the tolerance or the sampling interval"
+            "increase the tolerance or the sampling interval",
+            code="program.points.too_many",
         )
 
 

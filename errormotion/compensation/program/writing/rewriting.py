@@ -100,9 +100,13 @@ class Rewriting:
 
     def __init__(self, reader: Reader, correcting: Correcting, *, tolerance: float = 1e-6, step: float = 2e-3) -> None:
         if not (math.isfinite(tolerance) and 1e-8 <= tolerance <= 1e-3):
-            raise ProgramError(f"tolerance: expected 0.01 um to 1 mm; found {1e6 * tolerance:g} um")
+            raise ProgramError(
+                f"tolerance: expected 0.01 um to 1 mm; found {1e6 * tolerance:g} um", code="program.tolerance.outside"
+            )
         if not (math.isfinite(step) and 1e-5 <= step <= 1.0):
-            raise ProgramError(f"sampling interval: expected 0.01 mm to 1 m; found {1e3 * step:g} mm")
+            raise ProgramError(
+                f"sampling interval: expected 0.01 mm to 1 m; found {1e3 * step:g} mm", code="program.step.outside"
+            )
         self._reader, self._correcting = reader, correcting
         self._tolerance, self._step = tolerance, step
         self._writer = Writer()
@@ -153,10 +157,14 @@ class Rewriting:
                 number += 1
                 summary.written += len(made)
                 if summary.written > MAX_WRITTEN:
-                    raise ProgramError(f"the new program would exceed {MAX_WRITTEN} lines: increase the tolerance")
+                    raise ProgramError(
+                        f"the new program would exceed {MAX_WRITTEN} lines: increase the tolerance",
+                        code="program.result.too_long",
+                    )
                 if max(map(len, made)) > MAX_BLOCK >= len(item.block.text):
                     raise ProgramError(
-                        f"line {item.block.line} would exceed {MAX_BLOCK} characters, which controls do not read"
+                        f"line {item.block.line} would exceed {MAX_BLOCK} characters, which controls do not read",
+                        code="program.line.too_long",
                     )
                 yield from made
                 continue

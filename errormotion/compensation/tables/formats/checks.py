@@ -16,14 +16,18 @@ def check_points(table: AxisTable, most: int, control: str) -> None:
     if table.positions.size > most:
         raise DatasetError(
             f"{control} accepts at most {most} points; this table has {table.positions.size}. State a larger "
-            "step (--step)"
+            "step (--step)",
+            code="table.points.too_many",
         )
 
 
 def check_even(table: AxisTable, control: str) -> None:
     """Raise an error for points at unequal distances."""
     if np.isnan(table.step):
-        raise DatasetError(f"{control} requires points at equal distances; state the distance (--step)")
+        raise DatasetError(
+            f"{control} requires points at equal distances; state the distance (--step)",
+            code="table.points.not_equidistant",
+        )
 
 
 def one_direction(table: AxisTable, control: str) -> tuple[str, ...]:

@@ -64,7 +64,8 @@ class FanucTable:
         if table.component != table.axis:
             raise DatasetError(
                 f"FANUC's pitch error compensation acts along its axis; it has no table of {table.component} over "
-                f"{table.axis}"
+                f"{table.axis}",
+                code="table.component.not_supported",
             )
         check_even(table, "FANUC")
         zero = int(np.abs(table.positions).argmin())
@@ -72,14 +73,16 @@ class FanucTable:
             raise DatasetError(
                 "FANUC counts the compensation from the reference point at position 0, which is not a point of "
                 f"the table ({1e3 * table.positions[0]:g} to {1e3 * table.positions[-1]:g} mm in steps of "
-                f"{1e3 * table.step:g} mm). State a step of which all points are multiples (--step)"
+                f"{1e3 * table.step:g} mm). State a step of which all points are multiples (--step)",
+                code="table.reference.no_point",
             )
         count = table.positions.size
         if count - 1 > settings.most_points or settings.first_number + count > NUMBERS:
             raise DatasetError(
                 f"This FANUC control accepts at most {settings.most_points} points per axis (setting most_points), "
                 f"numbers up to {NUMBERS - 1}; this table has {count - 1} from {settings.first_number + 1}. State "
-                "a larger step (--step)"
+                "a larger step (--step)",
+                code="table.points.too_many",
             )
         wanted = table.mean - table.mean[zero]
         units = wanted / settings.detection_unit
@@ -130,7 +133,8 @@ def _magnification(units: Array, settings: FanucSettings) -> int:
     raise DatasetError(
         f"The correction changes by {1e6 * worst:.1f} um between two points; FANUC accepts at most "
         f"{1e6 * settings.largest_value * MAGNIFICATION * settings.detection_unit:.0f} um. State a smaller step "
-        "(--step)"
+        "(--step)",
+        code="table.step.too_large",
     )
 
 

@@ -61,7 +61,10 @@ class HeidenhainTable:
         check_points(table, settings.most_points, "This HEIDENHAIN control (setting most_points)")
         position = np.round(1e3 * table.positions, DECIMALS)
         if (np.diff(position) <= 0).any():
-            raise DatasetError("HEIDENHAIN requires increasing positions; state a larger step (--step)")
+            raise DatasetError(
+                "HEIDENHAIN requires increasing positions; state a larger step (--step)",
+                code="table.positions.not_increasing",
+            )
         turn = 1.0 if settings.inverted else -1.0
         values = [np.round(1e3 * offset, DECIMALS) + 0.0 for offset in (table.forward, table.backward)]
         axis, corrected = settings.axis_key or table.axis, settings.component_key or table.component

@@ -54,14 +54,18 @@ class LinuxCNCTable:
         """
         if table.component != table.axis:
             raise DatasetError(
-                f"LinuxCNC compensates a joint along itself; it has no table of {table.component} over {table.axis}"
+                f"LinuxCNC compensates a joint along itself; it has no table of {table.component} over {table.axis}",
+                code="table.component.not_supported",
             )
         check_points(table, MAX_POINTS, "LinuxCNC")
         scale = 1e3 if settings.unit == "mm" else 1e3 / 25.4
         decimals = DECIMALS if settings.unit == "mm" else DECIMALS + 2
         nominal = np.round(scale * table.positions, decimals)
         if (np.diff(nominal) <= 0).any():
-            raise DatasetError("LinuxCNC requires increasing positions; state a larger step (--step)")
+            raise DatasetError(
+                "LinuxCNC requires increasing positions; state a larger step (--step)",
+                code="table.positions.not_increasing",
+            )
         trims = [np.round(scale * offset, decimals) + 0.0 for offset in (table.forward, table.backward)]
         columns = [nominal, *(trims if settings.type else [nominal - trim for trim in trims])]
         rows = [" ".join(f"{value:.{decimals}f}" for value in row) for row in zip(*columns, strict=True)]

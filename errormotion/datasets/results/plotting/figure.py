@@ -63,14 +63,15 @@ def plot_errors(
         More than two dims, an unknown freedom, a form that the dataset does not have, or a wrong number of axes.
     """
     if not 0 <= k < math.inf:
-        raise DatasetError(f"Expected a coverage factor k of 0 or more; found {k!r}")
+        raise DatasetError(f"Expected a coverage factor k of 0 or more; found {k!r}", code="plot.coverage_factor")
     if at is not None:
         ds = ds.em.at(at)
     dims = ds.em.dims
     if len(dims) > 2:
         raise DatasetError(
             f"A plot shows errors over one or two dims; found {', '.join(dims)}. Select along the others first, such "
-            f"as ds.isel({dims[0]}=0)"
+            f"as ds.isel({dims[0]}=0)",
+            code="plot.dims.too_many",
         )
     names = chosen(ds, freedoms)
     if freedoms is None:
@@ -99,7 +100,7 @@ def plot_errors(
 
 def _form(ds: xr.Dataset, names: list[str], form: str, given: Sequence[Axes] | None) -> str:
     if form not in get_args(Form):
-        raise DatasetError(f"Expected a form of {', '.join(get_args(Form))}; found {form!r}")
+        raise DatasetError(f"Expected a form of {', '.join(get_args(Form))}; found {form!r}", code="plot.form.unknown")
     dims = ds.em.dims
     spatial = len(dims) == 1 and all(axis in ds.coords and ds[axis].dims == dims for axis in "xyz")
     triples = [triple for triple in arrows.TRIPLES if set(triple) <= set(names)]
@@ -107,10 +108,11 @@ def _form(ds: xr.Dataset, names: list[str], form: str, given: Sequence[Axes] | N
     if form == "arrows" and not (spatial and whole):
         raise DatasetError(
             "Arrows show EX, EY, EZ (or EA, EB, EC) at targets with x, y and z; found "
-            f"{', '.join(names)} over {', '.join(dims) or 'a single position'}"
+            f"{', '.join(names)} over {', '.join(dims) or 'a single position'}",
+            code="plot.arrows.no_targets",
         )
     if form == "map" and len(dims) != 2:
-        raise DatasetError(f"A map shows errors over two dims; found {', '.join(dims) or 'none'}")
+        raise DatasetError(f"A map shows errors over two dims; found {', '.join(dims) or 'none'}", code="plot.map.dims")
     if form != "auto":
         return form
     flat = given is not None and any(axes.name != "3d" for axes in given)
@@ -139,12 +141,14 @@ def _axes(panels: list[_Panel], form: str, given: Sequence[Axes] | None) -> tupl
     if given is not None:
         if len(given) != len(panels):
             shown = "; ".join(f"{', '.join(panel.freedoms)} in {panel.unit}" for panel in panels)
-            raise DatasetError(f"Expected {len(panels)} axes ({shown}); found {len(given)}")
+            raise DatasetError(f"Expected {len(panels)} axes ({shown}); found {len(given)}", code="plot.axes.count")
         if form == "arrows" and any(axes.name != "3d" for axes in given):
-            raise DatasetError('Arrows need axes that were made with projection="3d"')
+            raise DatasetError('Arrows need axes that were made with projection="3d"', code="plot.axes.projection")
         whole = given[0].get_figure(root=True)
         if whole is None:
-            raise DatasetError("Expected axes of a figure; found axes that were removed from theirs")
+            raise DatasetError(
+                "Expected axes of a figure; found axes that were removed from theirs", code="plot.axes.removed"
+            )
         return whole, given
     rows, columns = len(panels), 1
     if form == "arrows":

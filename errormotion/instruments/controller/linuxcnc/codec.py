@@ -74,9 +74,11 @@ def encode_request(number: int, op: str, arguments: Mapping[str, Any]) -> bytes:
     try:
         request = json.dumps({"id": number, "op": op, **arguments}, allow_nan=False).encode() + LINE_END
     except ValueError:
-        raise InstrumentError(f"Expected finite numbers; found {dict(arguments)}") from None
+        raise InstrumentError(f"Expected finite numbers; found {dict(arguments)}", code="request.not_finite") from None
     if len(request) > MAX_LINE:
-        raise InstrumentError(f"Expected a request of at most {MAX_LINE} bytes; '{op}' has {len(request)}")
+        raise InstrumentError(
+            f"Expected a request of at most {MAX_LINE} bytes; '{op}' has {len(request)}", code="request.too_long"
+        )
     return request
 
 
@@ -100,7 +102,8 @@ def decode_welcome(result: Any) -> tuple[bool, str]:
     except (ValueError, KeyError, TypeError) as error:
         raise ProtocolError(
             f"Expected the bridge of LinuxCNC with protocol {PROTOCOL}; found {str(result)[:200]} ({error!r}). Copy "
-            "bridge.py of this version to the machine"
+            "bridge.py of this version to the machine",
+            code="protocol.linuxcnc.version",
         ) from None
 
 
@@ -116,7 +119,9 @@ def decode_identity(facts: Any, simulated: bool, details: Mapping[str, Any], *mo
             details={**details, **{name: facts[name] for name in more}},
         )
     except (KeyError, TypeError):
-        raise ProtocolError(f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}") from None
+        raise ProtocolError(
+            f"Expected the identity of a LinuxCNC; found {str(facts)[:200]}", code="protocol.linuxcnc.form"
+        ) from None
 
 
 def decode_right(result: Any) -> tuple[bool, str]:
@@ -126,7 +131,8 @@ def decode_right(result: Any) -> tuple[bool, str]:
         return _switch(result, "compensate"), str(result["compensated_by"] or "")[:64]
     except (ValueError, KeyError, TypeError):
         raise ProtocolError(
-            "The bridge is of a version without compensation; copy bridge.py of this version to the machine"
+            "The bridge is of a version without compensation; copy bridge.py of this version to the machine",
+            code="protocol.linuxcnc.version",
         ) from None
 
 
@@ -138,7 +144,9 @@ def decode_offset(result: Any) -> Offset:
         busy, fault, route = (str(result[name])[:500] for name in ("busy", "fault", "route"))
         return Offset(route, (x, y, z), limit, slew, watchdog, busy, fault, str(result["by"] or "")[:64])
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ProtocolError(f"Expected the offset of LinuxCNC; found {str(result)[:200]} ({error!r})") from None
+        raise ProtocolError(
+            f"Expected the offset of LinuxCNC; found {str(result)[:200]} ({error!r})", code="protocol.linuxcnc.form"
+        ) from None
 
 
 def decode(line: bytes) -> Answer | Beat:
@@ -159,7 +167,9 @@ def decode(line: bytes) -> Answer | Beat:
             return Answer(message["id"], False, error=str(message["error"]))
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         pass
-    raise ProtocolError(f"Expected an answer of the bridge in JSON; found {line[:200]!r}")
+    raise ProtocolError(
+        f"Expected an answer of the bridge in JSON; found {line[:200]!r}", code="protocol.linuxcnc.form"
+    )
 
 
 def decode_state(result: Any) -> dict[str, Any]:
@@ -190,7 +200,9 @@ def decode_state(result: Any) -> dict[str, Any]:
             "alarms": [str(text) for text in state["alarms"]],
         }
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ProtocolError(f"Expected the state of LinuxCNC; found {str(result)[:200]} ({error!r})") from None
+        raise ProtocolError(
+            f"Expected the state of LinuxCNC; found {str(result)[:200]} ({error!r})", code="protocol.linuxcnc.form"
+        ) from None
 
 
 def decode_touch(result: Any) -> dict[str, Any]:
@@ -202,7 +214,9 @@ def decode_touch(result: Any) -> dict[str, Any]:
             raise ValueError("a touch at an unknown position")
         return {"tripped": tripped, "position": position, "time": _known(result, "time")}
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ProtocolError(f"Expected the result of a touch; found {str(result)[:200]} ({error!r})") from None
+        raise ProtocolError(
+            f"Expected the result of a touch; found {str(result)[:200]} ({error!r})", code="protocol.linuxcnc.form"
+        ) from None
 
 
 def _whole(text: str) -> int:

@@ -134,7 +134,9 @@ class LinuxCNC(Driver):
         until = time.monotonic() + ESTOP_TIMEOUT
         while not self.state()["estop"]:
             if time.monotonic() > until:
-                raise InstrumentError(f"{self.address}: LinuxCNC is not in e-stop after {ESTOP_TIMEOUT:g} s")
+                raise InstrumentError(
+                    f"{self.address}: LinuxCNC is not in e-stop after {ESTOP_TIMEOUT:g} s", code="linuxcnc.not_in_estop"
+                )
             time.sleep(ESTOP_INTERVAL)
 
     def home(self) -> None:
@@ -291,12 +293,14 @@ class LinuxCNC(Driver):
                 answer = self._await(line, self._number)
             except InstrumentError as error:
                 self._cut(line)
-                raise type(error)(f"{error}; during the command '{op.replace('_', ' ')}'") from None
+                raise error.restated(f"{error}; during the command '{op.replace('_', ' ')}'") from None
             except BaseException:  # an interrupted wait: the bridge aborts a command without a waiting client
                 self._cut(line)
                 raise
         if not answer.ok:
-            raise InstrumentError(f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}")
+            raise InstrumentError(
+                f"{self.address} refuses '{op.replace('_', ' ')}': {answer.error}", code="linuxcnc.refused"
+            )
         return answer.result
 
     def _await(self, line: Transport, number: int) -> codec.Answer:
@@ -308,11 +312,14 @@ class LinuxCNC(Driver):
                 )
             except InstrumentTimeoutError:
                 error = InstrumentTimeoutError(
-                    f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s"
+                    f"{self.address}: the bridge of LinuxCNC did not answer within {self.settings.timeout:g} s",
+                    code="instrument.no_answer",
                 )
                 raise after_others(error, others, f"request {number}") from None
             if message.number is None and not getattr(message, "ok", True):
-                raise InstrumentError(f"{self.address}: the bridge ends the connection: {message.error}; {_WHERE}")
+                raise InstrumentError(
+                    f"{self.address}: the bridge ends the connection: {message.error}; {_WHERE}", code="connection.lost"
+                )
             if message.number in self._unawaited:
                 self._unawaited.discard(message.number)
                 others += 1
@@ -321,7 +328,10 @@ class LinuxCNC(Driver):
                 others += 1
                 continue
             if message.number != number:
-                raise ProtocolError(f"{self.address}: expected the answer to request {number}; found {message}")
+                raise ProtocolError(
+                    f"{self.address}: expected the answer to request {number}; found {message}",
+                    code="protocol.reply.other",
+                )
             if isinstance(message, codec.Answer):
                 return message
 
@@ -364,14 +374,18 @@ class LinuxCNC(Driver):
         if not answer.ok and "unknown operation" in answer.error:
             raise InstrumentError(
                 f"{self.address}: the bridge is of an earlier version, without access control; copy bridge.py of this "
-                "version to the machine"
+                "version to the machine",
+                code="linuxcnc.version",
             )
         if not answer.ok:
-            raise InstrumentError(f"{self.address} refuses the connection: {answer.error}; {_WHERE}")
+            raise InstrumentError(
+                f"{self.address} refuses the connection: {answer.error}; {_WHERE}", code="linuxcnc.connection.refused"
+            )
         control, other = codec.decode_welcome(answer.result)
         if self.settings.arm and not control:
             raise InstrumentError(
-                f"{self.address}: another client controls the machine ({other}); end it, or only read (arm = false)"
+                f"{self.address}: another client controls the machine ({other}); end it, or only read (arm = false)",
+                code="linuxcnc.controlled_by_other",
             )
 
     def _start_session(self) -> None:
@@ -415,13 +429,18 @@ def read_token(path: Path, address: str) -> str:
                 raise InstrumentError(
                     f"{address}: expected a token in {path} that only this user can read; found the mode "
                     f"{stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}. Use 'chmod 600 {path}', and a new "
-                    "token if others have seen it"
+                    "token if others have seen it",
+                    code="linuxcnc.token.not_private",
                 )
             token = file.read(4096).strip()
     except OSError as error:
         raise InstrumentError(
-            f"{address}: expected the token of the bridge in {path}; found none ({error.strerror}); {_WHERE}"
+            f"{address}: expected the token of the bridge in {path}; found none ({error.strerror}); {_WHERE}",
+            code="linuxcnc.token.missing",
         ) from None
     if not token:
-        raise InstrumentError(f"{address}: expected the token of the bridge in {path}; the file is empty; {_WHERE}")
+        raise InstrumentError(
+            f"{address}: expected the token of the bridge in {path}; the file is empty; {_WHERE}",
+            code="linuxcnc.token.missing",
+        )
     return token

@@ -78,11 +78,13 @@ def _named(device: Device, key: str, name: str) -> DataItem:
     item = device.items.get(name) or next((each for each in device.items.values() if each.name == name), None)
     if item is None:
         raise InstrumentError(
-            f"'{key}': the device '{device.name}' has no data item '{name}'; it has {', '.join(sorted(device.items))}"
+            f"'{key}': the device '{device.name}' has no data item '{name}'; it has {', '.join(sorted(device.items))}",
+            code="mtconnect.item.unknown",
         )
     if item.representation not in (*_SINGLE_VALUES, TIME_SERIES):
         raise InstrumentError(
-            f"'{key}': the data item '{name}' is a {item.representation} of keys and values; state one with one value"
+            f"'{key}': the data item '{name}' is a {item.representation} of keys and values; state one with one value",
+            code="mtconnect.item.several_values",
         )
     return item
 
@@ -114,7 +116,8 @@ def _spindle(device: Device, settings: MTConnectSettings) -> Callable[[DataItem]
     if not any(fits(item) for item in device.items.values()):
         names = sorted({item.component_name for item in device.items.values() if item.component == "Rotary"})
         raise InstrumentError(
-            f"The device '{device.name}' has no rotary axis '{settings.spindle}'; it has {', '.join(names) or 'none'}"
+            f"The device '{device.name}' has no rotary axis '{settings.spindle}'; it has {', '.join(names) or 'none'}",
+            code="mtconnect.axis.unknown",
         )
     return fits
 

@@ -111,7 +111,10 @@ class DataItem:
         units = self.units or _UNITS_OF.get(self.type, "")
         if units not in _SI:
             known = ", ".join(sorted(_SI))
-            raise ProtocolError(f"The data item '{self.id}' ({self.type}) is in '{units}'; expected one of {known}")
+            raise ProtocolError(
+                f"The data item '{self.id}' ({self.type}) is in '{units}'; expected one of {known}",
+                code="protocol.mtconnect.unit",
+            )
         return _SI[units]
 
 
@@ -172,7 +175,10 @@ class Observation:
         found = []
         for word in self.value.split():
             if not _NUMBER.fullmatch(word) or math.isinf(float(word)):
-                raise ProtocolError(f"The data item '{self.item}': expected a number; found '{self.value[:40]}'")
+                raise ProtocolError(
+                    f"The data item '{self.item}': expected a number; found '{self.value[:40]}'",
+                    code="protocol.mtconnect.number",
+                )
             found.append(float(word) * scale)
         return found or [math.nan]
 
@@ -207,7 +213,10 @@ def parse(data: bytes) -> Document:
         case "MTConnectError":
             return Document(header, errors=_errors(root))
         case _:
-            raise ProtocolError(f"Expected a document of MTConnect (devices, streams or an error); found <{kind[:40]}>")
+            raise ProtocolError(
+                f"Expected a document of MTConnect (devices, streams or an error); found <{kind[:40]}>",
+                code="protocol.mtconnect.form",
+            )
 
 
 def _whole(element: Element, name: str, default: int | None = None) -> int:
@@ -215,7 +224,9 @@ def _whole(element: Element, name: str, default: int | None = None) -> int:
     if not text and default is not None:
         return default
     if not (text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS):
-        raise ProtocolError(f"<{element.name}>: expected a number '{name}'; found '{text[:40]}'")
+        raise ProtocolError(
+            f"<{element.name}>: expected a number '{name}'; found '{text[:40]}'", code="protocol.mtconnect.number"
+        )
     return int(text)
 
 
@@ -228,18 +239,25 @@ def parse_time(text: str) -> float:
         The text is not such a time.
     """
     if len(text) > _MAX_TIME:
-        raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'")
+        raise ProtocolError(
+            f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'", code="protocol.time.form"
+        )
     try:
         time = datetime.fromisoformat(text.partition("@")[0].strip())
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
-        raise ProtocolError(f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'") from None
+        raise ProtocolError(
+            f"Expected a time such as 2025-03-01T12:00:00Z; found '{text[:40]}'", code="protocol.time.form"
+        ) from None
 
 
 def _header(root: Element) -> Header:
     header = root.child("Header")
     if header is None:
-        raise ProtocolError(f"Expected a document of MTConnect; found <{root.name[:40]}> without a header")
+        raise ProtocolError(
+            f"Expected a document of MTConnect; found <{root.name[:40]}> without a header",
+            code="protocol.mtconnect.form",
+        )
     return Header(
         instance=_whole(header, "instanceId"),
         created=parse_time(header.get("creationTime")),
@@ -287,7 +305,9 @@ def _items(device: Element) -> Iterator[DataItem]:
 
 def _item(item: Element, component: Element, systems: Mapping[str, str]) -> DataItem:
     if not item.get("id") or not item.get("type"):
-        raise ProtocolError(f"Expected data items with id and type; found {str(item.attributes)[:200]}")
+        raise ProtocolError(
+            f"Expected data items with id and type; found {str(item.attributes)[:200]}", code="protocol.mtconnect.form"
+        )
     coordinates = item.get("coordinateSystem")
     if reference := item.get("coordinateSystemIdRef"):  # from version 2.0 on
         kind = systems.get(reference, "UNKNOWN")

@@ -212,7 +212,7 @@ class MTConnect(Driver):
             finally:
                 parts.close()  # type: ignore[attr-defined]
             if not received:
-                raise InstrumentError(f"The agent at {self.address} ended its stream without data")
+                raise InstrumentError(f"The agent at {self.address} ended its stream without data", code="stream.ended")
             yield self.sample()
 
     # ------------------------------------------------------------------ sequence numbers
@@ -263,7 +263,8 @@ class MTConnect(Driver):
         self._count(lost)
         raise InstrumentError(
             f"The agent at {self.address} overwrites its {document.header.buffer} observations faster than they can be "
-            "requested; configure a larger buffer or fewer data items"
+            "requested; configure a larger buffer or fewer data items",
+            code="mtconnect.buffer.too_small",
         )
 
     def _count(self, lost: int) -> None:
@@ -320,9 +321,10 @@ class MTConnect(Driver):
             if answer.status != 200:
                 raise ProtocolError(
                     f"The server at {self.address} answers '{request}' with HTTP status {answer.status} without a "
-                    "document of MTConnect. Check the address, its port and path"
+                    "document of MTConnect. Check the address, its port and path",
+                    code="protocol.http.status",
                 ) from None
-            raise ProtocolError(f"{self.address}/{request}: {error}") from None
+            raise ProtocolError(f"{self.address}/{request}: {error}", code=error.code) from None
         self._buffer_size = document.header.buffer
         if refused:
             self._refuse(document, request)
@@ -331,14 +333,17 @@ class MTConnect(Driver):
     def _refuse(self, document: Document, request: str) -> None:
         if document.errors:
             errors = "; ".join(f"{code}: {text}" for code, text in document.errors.items())
-            raise InstrumentError(f"The agent at {self.address} refuses '{request}': {errors}")
+            raise InstrumentError(
+                f"The agent at {self.address} refuses '{request}': {errors}", code="instrument.refused"
+            )
 
     def _one(self, document: Document) -> Device:
         if len(document.devices) != 1:
             names = ", ".join(device.name or device.uuid for device in document.devices) or "none"
             raise InstrumentError(
                 f"The agent at {self.address} has the devices {names}; state one in the address, as in "
-                "http://HOST:5000/DEVICE"
+                "http://HOST:5000/DEVICE",
+                code="mtconnect.device.ambiguous",
             )
         return document.devices[0]
 

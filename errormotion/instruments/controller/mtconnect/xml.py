@@ -63,7 +63,9 @@ def parse_tree(data: bytes) -> Element:
         The data are not XML, have a document type, or exceed a limit of this module.
     """
     if len(data) > LONGEST:
-        raise ProtocolError(f"Expected a document of at most {LONGEST} bytes; found {len(data)}")
+        raise ProtocolError(
+            f"Expected a document of at most {LONGEST} bytes; found {len(data)}", code="protocol.xml.too_large"
+        )
     builder = _Builder()
     try:
         parser = expat.ParserCreate()
@@ -76,9 +78,11 @@ def parse_tree(data: bytes) -> Element:
             parser.Parse(data[start : start + _PIECE], False)
         parser.Parse(b"", True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two: unknown encodings
-        raise ProtocolError(f"Expected XML; found {data[:60]!r}, which cannot be parsed ({error})") from None
+        raise ProtocolError(
+            f"Expected XML; found {data[:60]!r}, which cannot be parsed ({error})", code="protocol.xml.form"
+        ) from None
     if builder.root is None:
-        raise ProtocolError(f"Expected XML; found {data[:60]!r}")
+        raise ProtocolError(f"Expected XML; found {data[:60]!r}", code="protocol.xml.form")
     return builder.root
 
 
@@ -92,13 +96,23 @@ class _Builder:
     def start(self, name: str, attributes: dict[str, str]) -> None:
         self._count += 1
         if self._count > MAX_ELEMENTS:
-            raise ProtocolError(f"Expected a document of at most {MAX_ELEMENTS} elements")
+            raise ProtocolError(
+                f"Expected a document of at most {MAX_ELEMENTS} elements", code="protocol.xml.too_large"
+            )
         if len(self._open) >= MAX_DEPTH:
-            raise ProtocolError(f"Expected elements nested at most {MAX_DEPTH} deep; found <{name[:40]}> below that")
+            raise ProtocolError(
+                f"Expected elements nested at most {MAX_DEPTH} deep; found <{name[:40]}> below that",
+                code="protocol.xml.too_large",
+            )
         if len(attributes) > MAX_ATTRIBUTES:
-            raise ProtocolError(f"<{name[:40]}>: expected at most {MAX_ATTRIBUTES} attributes; found {len(attributes)}")
+            raise ProtocolError(
+                f"<{name[:40]}>: expected at most {MAX_ATTRIBUTES} attributes; found {len(attributes)}",
+                code="protocol.xml.too_large",
+            )
         if len(name) > MAX_NAME or any(len(key) > MAX_NAME for key in attributes):
-            raise ProtocolError(f"<{name[:40]}>: expected names of at most {MAX_NAME} characters")
+            raise ProtocolError(
+                f"<{name[:40]}>: expected names of at most {MAX_NAME} characters", code="protocol.xml.too_large"
+            )
         plain = {
             key: value for key, value in attributes.items() if ":" not in key
         }  # attributes of MTConnect have no prefix
@@ -118,4 +132,7 @@ class _Builder:
             self._pieces[-1].append(data)
 
     def doctype(self, name: str, *_: object) -> None:
-        raise ProtocolError(f"Expected a document of MTConnect without document type; found '{name[:40]}'")
+        raise ProtocolError(
+            f"Expected a document of MTConnect without document type; found '{name[:40]}'",
+            code="protocol.xml.document_type",
+        )

@@ -145,13 +145,18 @@ class OpcUa(Driver):
         answers = request(self.transport, {"read": list(nodes)})
         whole = isinstance(answers, list) and len(answers) == len(nodes)
         if not whole or not all(isinstance(each, dict) and {"value", "time"} <= each.keys() for each in answers):
-            raise ProtocolError(f"{self.address}: expected the values of {len(nodes)} nodes; found {str(answers)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected the values of {len(nodes)} nodes; found {str(answers)[:80]}",
+                code="protocol.opcua.count",
+            )
         return list(answers)
 
     def _browse(self, node: str) -> list[Mapping[str, Any]]:
         found = request(self.transport, {"browse": node})
         if not isinstance(found, list) or not all(_is_child(each) for each in found):
-            raise ProtocolError(f"{self.address}: expected the children of {node}; found {str(found)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected the children of {node}; found {str(found)[:80]}", code="protocol.opcua.form"
+            )
         return found
 
     def _connect(self) -> Transport:
@@ -168,7 +173,10 @@ class OpcUa(Driver):
         server = request(self.transport, {"server": True})
         namespaces = server.get("namespaces") if isinstance(server, dict) else None
         if not isinstance(namespaces, list):
-            raise ProtocolError(f"{self.address}: expected the namespaces of the server; found {str(server)[:80]}")
+            raise ProtocolError(
+                f"{self.address}: expected the namespaces of the server; found {str(server)[:80]}",
+                code="protocol.opcua.form",
+            )
         root = model.interface(namespaces, self._browse)
         found: dict[str, str] = {}
         if root:
@@ -182,12 +190,16 @@ class OpcUa(Driver):
         if not self._nodes:
             raise InstrumentError(
                 f"The server at {self.address} has no object CncInterface (OPC 40502); state nodes in the settings, "
-                "as in nodes.spindle_speed = 'ns=2;s=/Channel/Spindle/actSpeed[u1,1]'"
+                "as in nodes.spindle_speed = 'ns=2;s=/Channel/Spindle/actSpeed[u1,1]'",
+                code="opcua.object.missing",
             )
         self._factors = {key: self._factor(key) for key in NUMBERS if key in self._nodes}
         for key, value in zip(self._nodes, self._read(list(self._nodes.values())), strict=True):
             if key in self.settings.nodes and value["value"] is None and value.get("status") != "Good":
-                raise InstrumentError(f"nodes.{key} = '{self._nodes[key]}': the server answers {value.get('status')}")
+                raise InstrumentError(
+                    f"nodes.{key} = '{self._nodes[key]}': the server answers {value.get('status')}",
+                    code="opcua.node.no_value",
+                )
 
     def _factor(self, key: str) -> float:
         """Return the factor from the unit of a node to that of the state."""

@@ -119,7 +119,10 @@ def factor(key: str, stated: Any, settings: OpcUaSettings) -> float:
             return _scaled(UNIT_CODES[code], UNITS[name], f"'{key}'")
         if unit:
             return _scaled({"rpm": "1/min", "r/min": "1/min"}.get(unit, unit), UNITS[name], f"'{key}'")
-    raise InstrumentError(f"'{key}': the server does not state its unit; state it in the settings: units.{name} = 'mm'")
+    raise InstrumentError(
+        f"'{key}': the server does not state its unit; state it in the settings: units.{name} = 'mm'",
+        code="opcua.unit.missing",
+    )
 
 
 def _scaled(unit: str, target: str, what: str) -> float:
@@ -128,7 +131,9 @@ def _scaled(unit: str, target: str, what: str) -> float:
     try:
         return float(convert(1.0, unit, target))
     except DatasetError as error:
-        raise InstrumentError(f"{what}: expected a unit that converts to {target}; found '{unit}' ({error})") from None
+        raise InstrumentError(
+            f"{what}: expected a unit that converts to {target}; found '{unit}' ({error})", code="opcua.unit.other"
+        ) from None
 
 
 def _present(parts: Mapping[str, str], names: Mapping[str, str]) -> dict[str, str]:
@@ -140,7 +145,12 @@ def _one(what: str, found: Mapping[str, str], name: str) -> str:
     if name:
         if name in found or not found:
             return found.get(name, "")
-        raise InstrumentError(f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}")
+        raise InstrumentError(
+            f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}", code="opcua.object.unknown"
+        )
     if len(found) > 1:
-        raise InstrumentError(f"The server has several: {what} {', '.join(sorted(found))}; state one in the settings")
+        raise InstrumentError(
+            f"The server has several: {what} {', '.join(sorted(found))}; state one in the settings",
+            code="opcua.object.ambiguous",
+        )
     return next(iter(found.values()), "")

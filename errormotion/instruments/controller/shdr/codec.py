@@ -111,7 +111,10 @@ class Lines:
         if size > MAX_LINE_BYTES:
             start = bytes(self._buffer[:40])
             self.clear()
-            raise ProtocolError(f"Expected lines of at most {MAX_LINE_BYTES} bytes; found {size}, near {start!r}")
+            raise ProtocolError(
+                f"Expected lines of at most {MAX_LINE_BYTES} bytes; found {size}, near {start!r}",
+                code="protocol.shdr.line",
+            )
 
     def _skips(self, line: bytes) -> bool:
         if self._asset_end:
@@ -121,7 +124,9 @@ class Lines:
             elif self._asset_bytes > MAX_ASSET_BYTES:
                 end = self._asset_end[:60]
                 self.clear()
-                raise ProtocolError(f"Expected the end {end!r} of an asset within {MAX_ASSET_BYTES} bytes")
+                raise ProtocolError(
+                    f"Expected the end {end!r} of an asset within {MAX_ASSET_BYTES} bytes", code="protocol.shdr.asset"
+                )
             return True
         if b"|@ASSET@|" in line:
             mark = line.rpartition(b"|")[2]
@@ -149,7 +154,7 @@ def parse_line(line: bytes, keys: Keys = Keys()) -> Command | list[Observed]:
         return Command(name.strip(), value.strip())
     fields = split_fields(text)
     if len(fields) < 3:
-        raise ProtocolError(f"Expected time|key|value; found '{text[:60]}'")
+        raise ProtocolError(f"Expected time|key|value; found '{text[:60]}'", code="protocol.shdr.line")
     time = parse_time(fields[0])
     if fields[1].startswith("@"):
         return []
@@ -176,7 +181,9 @@ def split_fields(text: str) -> list[str]:
     """
     parts = text.split("|", MAX_FIELDS + 1)
     if len(parts) > MAX_FIELDS:
-        raise ProtocolError(f"Expected at most {MAX_FIELDS} fields; the line starts '{text[:60]}'")
+        raise ProtocolError(
+            f"Expected at most {MAX_FIELDS} fields; the line starts '{text[:60]}'", code="protocol.shdr.line"
+        )
     found: list[str] = []
     quoted: list[str] = []
     for part in parts:
@@ -212,7 +219,9 @@ def parse_time(text: str) -> float:
         time = datetime.fromisoformat(word)
         return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
-        raise ProtocolError(f"Expected a time such as 2009-06-15T00:00:00.25Z; found '{text[:40]}'") from None
+        raise ProtocolError(
+            f"Expected a time such as 2009-06-15T00:00:00.25Z; found '{text[:40]}'", code="protocol.time.form"
+        ) from None
 
 
 def parse_numbers(text: str) -> list[float]:
@@ -228,7 +237,7 @@ def parse_numbers(text: str) -> list[float]:
     found = []
     for word in text.partition(":")[0].split():
         if not _NUMBER.fullmatch(word) or math.isinf(float(word)):
-            raise ProtocolError(f"Expected a number; found '{text[:40]}'")
+            raise ProtocolError(f"Expected a number; found '{text[:40]}'", code="protocol.shdr.number")
         found.append(float(word))
     return found or [math.nan]
 
@@ -240,11 +249,16 @@ def _observed(fields: list[str], time: float, keys: Keys, text: str) -> Iterator
         alone = index == 0
         size = _size(key, rest, keys, alone=alone)
         if not key or len(rest) < size:
-            raise ProtocolError(f"Expected a key and {size} fields after it; found '{text[:60]}'")
+            raise ProtocolError(
+                f"Expected a key and {size} fields after it; found '{text[:60]}'", code="protocol.shdr.line"
+            )
         if size == 5:
             level, code, _, _, message = rest[:5]
             if level.upper() not in LEVELS:
-                raise ProtocolError(f"The condition '{key[:40]}': expected {', '.join(LEVELS)}; found '{level[:40]}'")
+                raise ProtocolError(
+                    f"The condition '{key[:40]}': expected {', '.join(LEVELS)}; found '{level[:40]}'",
+                    code="protocol.shdr.condition",
+                )
             yield Observed(key, message, time, level.upper(), code)
         elif size == 3:
             words = rest[2].split()

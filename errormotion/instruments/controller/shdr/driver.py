@@ -220,13 +220,14 @@ class Shdr(Driver):
 
     def _process(self, data: bytes) -> bool:
         """Process received bytes; return whether they contain ``* PONG``."""
-        answered, wrong = False, ""
+        answered = False
+        wrong: ProtocolError | None = None
         for line in self._lines.feed(data):
             try:
                 found = parse_line(line, self._keys)
             except ProtocolError as error:
                 self.malformed += 1
-                wrong = wrong or str(error)
+                wrong = wrong or error
                 continue
             if isinstance(found, Command):
                 answered = self._command(found) or answered
@@ -237,7 +238,9 @@ class Shdr(Driver):
                         self.malformed += 1
                         log.warning("%s: key '%s' is unknown: %s", self.address, observed.key, observed.doubt)
         if wrong and not self.settings.lenient:
-            raise ProtocolError(f"{self.address}: {wrong}; set 'lenient' to ignore and count such lines")
+            raise ProtocolError(
+                f"{self.address}: {wrong}; set 'lenient' to ignore and count such lines", code=wrong.code
+            )
         if wrong:
             log.warning("%s: %s; the line was ignored", self.address, wrong)
         return answered
@@ -265,7 +268,9 @@ class Shdr(Driver):
             if self._silent:
                 self._drain(0.0)
                 if time.monotonic() - self._last_data > self.settings.silence:
-                    raise InstrumentTimeoutError(f"{self.address}: no data for {self.settings.silence:g} s")
+                    raise InstrumentTimeoutError(
+                        f"{self.address}: no data for {self.settings.silence:g} s", code="instrument.no_answer"
+                    )
                 return
             self._ping()
             if self._fresh:
@@ -310,7 +315,8 @@ class Shdr(Driver):
         if not (self._fresh and self._memory.values):
             others = f", but {received} bytes of other lines" if received else "; is it an SHDR adapter?"
             raise InstrumentTimeoutError(
-                f"{self.address}: no answer to '* PING' within {self.settings.timeout:g} s{others}"
+                f"{self.address}: no answer to '* PING' within {self.settings.timeout:g} s{others}",
+                code="instrument.no_answer",
             )
         self.heartbeat = math.inf
         log.warning("%s: the adapter has no heartbeat; values expire after %g s", self.address, self.settings.silence)

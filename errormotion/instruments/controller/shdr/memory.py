@@ -58,7 +58,10 @@ class Memory:
             if observed.doubt:
                 self.doubtful[observed.key] = observed.doubt
         else:
-            raise ProtocolError(f"Expected at most {MAX_KEYS} keys; found '{observed.key[:40]}' in addition")
+            raise ProtocolError(
+                f"Expected at most {MAX_KEYS} keys; found '{observed.key[:40]}' in addition",
+                code="protocol.shdr.too_many",
+            )
 
     def text(self, key: str) -> str:
         """Return a value; empty if it is unknown."""
@@ -101,4 +104,4 @@ class Memory:
         elif len(self.conditions) < MAX_CONDITIONS or (observed.key, observed.code) in self.conditions:
             self.conditions[observed.key, observed.code] = observed
         else:
-            raise ProtocolError(f"Expected at most {MAX_CONDITIONS} conditions at once")
+            raise ProtocolError(f"Expected at most {MAX_CONDITIONS} conditions at once", code="protocol.shdr.too_many")

@@ -59,25 +59,36 @@ class Reply:
                 number = math.inf
             if math.isfinite(number):
                 return number
-        raise ProtocolError(f"Value {index + 1} of a reply: expected a number; found {str(value)[:40]!r}")
+        raise ProtocolError(
+            f"Value {index + 1} of a reply: expected a number; found {str(value)[:40]!r}",
+            code="protocol.reply.number_form",
+        )
 
     def flag(self, index: int) -> bool:
         """Return true or false; ProtocolError if it is neither."""
         value = self._value(index)
         if not isinstance(value, bool):
-            raise ProtocolError(f"Value {index + 1} of a reply: expected true or false; found {str(value)[:40]!r}")
+            raise ProtocolError(
+                f"Value {index + 1} of a reply: expected true or false; found {str(value)[:40]!r}",
+                code="protocol.reply.form",
+            )
         return value
 
     def text(self, index: int) -> str:
         """Return a text of at most 200 printable characters; ProtocolError if it is invalid."""
         value = self._value(index)
         if not isinstance(value, str) or len(value) > 200 or not value.isprintable():
-            raise ProtocolError(f"Value {index + 1} of a reply: expected a short text; found {str(value)[:40]!r}")
+            raise ProtocolError(
+                f"Value {index + 1} of a reply: expected a short text; found {str(value)[:40]!r}",
+                code="protocol.reply.form",
+            )
         return value
 
     def _value(self, index: int) -> Any:
         if index >= len(self.values):
-            raise ProtocolError(f"A reply has {len(self.values)} values; expected at least {index + 1}")
+            raise ProtocolError(
+                f"A reply has {len(self.values)} values; expected at least {index + 1}", code="protocol.reply.length"
+            )
         return self.values[index]
 
 
@@ -103,7 +114,9 @@ def reply(line: bytes) -> Reply:
         Not a reply of an IDS3010, or longer than ``MAX_REPLY``.
     """
     if len(line) > MAX_REPLY:
-        raise ProtocolError(f"A reply of {len(line)} bytes; expected at most {MAX_REPLY}")
+        raise ProtocolError(
+            f"A reply of {len(line)} bytes; expected at most {MAX_REPLY}", code="protocol.reply.too_long"
+        )
     try:
         found = json.loads(line, parse_constant=_refuse)
     except (ValueError, RecursionError):
@@ -111,15 +124,20 @@ def reply(line: bytes) -> Reply:
     if not isinstance(found, dict) or found.get("jsonrpc") != "2.0":
         raise ProtocolError(
             f'Expected a reply such as \'{{"jsonrpc":"2.0","id":1,"result":[0]}}\'; found {line[:60]!r}. Check '
-            "that the address is port 9090 of an IDS3010"
+            "that the address is port 9090 of an IDS3010",
+            code="protocol.reply.form",
         )
     number, result, error = found.get("id"), found.get("result"), found.get("error")
     if not (number is None or (isinstance(number, int) and not isinstance(number, bool))):
-        raise ProtocolError(f"The number of a reply: expected an integer; found {str(number)[:40]!r}")
+        raise ProtocolError(
+            f"The number of a reply: expected an integer; found {str(number)[:40]!r}", code="protocol.reply.number_form"
+        )
     if isinstance(error, dict):
         return Reply(number, refusal=f"{str(error.get('message', ''))[:120]} ({str(error.get('code', ''))[:12]})")
     if not isinstance(result, list) or not result or number is None:
-        raise ProtocolError(f"Expected a reply with a number and a result; found {line[:60]!r}")
+        raise ProtocolError(
+            f"Expected a reply with a number and a result; found {line[:60]!r}", code="protocol.reply.form"
+        )
     return Reply(number, _code(result[0]), tuple(result[1:]))
 
 
@@ -129,7 +147,8 @@ def _code(value: Any) -> int:
     if not isinstance(value, int) or isinstance(value, bool):
         raise ProtocolError(
             f"The first value of a reply: expected the number of an error or a warning; found {str(value)[:40]!r}. A "
-            f"firmware before version {API} of the interface has none: update it"
+            f"firmware before version {API} of the interface has none: update it",
+            code="protocol.reply.number_form",
         )
     return value
 

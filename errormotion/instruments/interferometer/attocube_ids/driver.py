@@ -78,7 +78,7 @@ class AttocubeIds(Driver):
         found = self._reply(method, *parameters)
         if found.refusal:
             method = codec.in_family(method, self._family)
-            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}")
+            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}", code="instrument.refused")
         return found
 
     def _reply(self, method: str, *parameters: bool | int | str) -> codec.Reply:
@@ -98,7 +98,9 @@ class AttocubeIds(Driver):
         """Return the reply to a request that must succeed."""
         found = self._call(method, *parameters)
         if found.code:
-            raise InstrumentError(f"{self.address} refuses '{method}': {self._meaning(found.code)}")
+            raise InstrumentError(
+                f"{self.address} refuses '{method}': {self._meaning(found.code)}", code="instrument.refused"
+            )
         return found
 
     def _meaning(self, code: int) -> str:
@@ -115,12 +117,15 @@ class AttocubeIds(Driver):
         self._lost: dict[int, str] = {}  # reasons by axis, until the next zero
         model = self._device_type()
         if not model.startswith("IDS"):
-            raise InstrumentError(f"{self.address}: expected an IDS3010; found '{model}'")
+            raise InstrumentError(
+                f"{self.address}: expected an IDS3010; found '{model}'", code="instrument.model.unknown"
+            )
         passes = self._passes()
         if self.settings.passes not in ("as_set", passes):
             raise InstrumentError(
                 f"{self.address}: expected a device in {self.settings.passes} pass mode (setting 'passes'); it is in "
-                f"{passes} pass mode"
+                f"{passes} pass mode",
+                code="interferometer.passes.differ",
             )
         self._prepare()
 
@@ -131,10 +136,12 @@ class AttocubeIds(Driver):
             found = self._reply(codec.SYSTEM + "getDeviceType")
             if not found.refusal:
                 if found.code:
-                    raise InstrumentError(f"{self.address} refuses its type: {self._meaning(found.code)}")
+                    raise InstrumentError(
+                        f"{self.address} refuses its type: {self._meaning(found.code)}", code="instrument.refused"
+                    )
                 return found.text(0)
             refusals.append(f"'{codec.in_family(codec.SYSTEM, self._family)}getDeviceType': {found.refusal}")
-        raise InstrumentError(f"{self.address} refuses {'; '.join(refusals)}")
+        raise InstrumentError(f"{self.address} refuses {'; '.join(refusals)}", code="instrument.refused")
 
     def _passes(self) -> str:
         mode = self._request(codec.AXIS + "getPassMode").quantity(0)
@@ -146,12 +153,14 @@ class AttocubeIds(Driver):
         if mode not in (IDLE, *STARTING, RUNNING):
             raise InstrumentError(
                 f"{self.address}: expected a device that measures or is idle; its mode is '{mode}'. End the alignment "
-                "of the optics first"
+                "of the optics first",
+                code="interferometer.mode.other",
             )
         if mode == IDLE:
             if not self.settings.start:
                 raise InstrumentError(
-                    f"{self.address} does not measure. Start the measurement at the device, or set 'start = true'"
+                    f"{self.address} does not measure. Start the measurement at the device, or set 'start = true'",
+                    code="interferometer.not_measuring",
                 )
             self._start()
         elif mode in STARTING:
@@ -181,12 +190,14 @@ class AttocubeIds(Driver):
             if goal == RUNNING and mode == IDLE:
                 code = self._call(codec.SYSTEM + "getSystemError").code
                 raise InstrumentError(
-                    f"{self.address} has not started to measure: {self._meaning(code)}. Check that beams are aligned"
+                    f"{self.address} has not started to measure: {self._meaning(code)}. Check that beams are aligned",
+                    code="interferometer.not_started",
                 )
             if time.monotonic() > deadline:
                 raise InstrumentTimeoutError(
                     f"{self.address}: expected the mode '{goal}' within {self.settings.start_timeout:g} s; found "
-                    f"'{mode}'"
+                    f"'{mode}'",
+                    code="instrument.no_answer",
                 )
             time.sleep(POLL_INTERVAL)
 
@@ -247,7 +258,9 @@ class AttocubeIds(Driver):
         if found.code == 0:
             return found.length(0)
         if (mode := self._mode()) != RUNNING:
-            raise InstrumentError(f"{self.address} has stopped measuring; its mode is '{mode}'")
+            raise InstrumentError(
+                f"{self.address} has stopped measuring; its mode is '{mode}'", code="interferometer.not_measuring"
+            )
         if axis not in self._lost:
             self._lost[axis] = f"count lost: {self._meaning(found.code)}"
         return math.nan
@@ -274,7 +287,8 @@ class AttocubeIds(Driver):
         if self._lost:
             broken = ", ".join(f"{axis_name(axis)} ({reason})" for axis, reason in self._lost.items())
             raise InstrumentError(
-                f"{self.address}: the zero cannot be set while a beam is broken: {broken}. Align its reflector"
+                f"{self.address}: the zero cannot be set while a beam is broken: {broken}. Align its reflector",
+                code="interferometer.beam.broken",
             )
         self._zero = found
 

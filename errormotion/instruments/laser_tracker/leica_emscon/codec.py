@@ -226,7 +226,8 @@ def decode_header(data: bytes | bytearray) -> tuple[int, int]:
     if not (HEADER.size + 4 <= size <= MAX_PACKET_BYTES and known):
         raise ProtocolError(
             f"Expected the header of an emScon packet; found {data.hex(' ')}, {size} bytes of type {kind}. Check "
-            "that the address is that of an emScon server"
+            "that the address is that of an emScon server",
+            code="protocol.reply.form",
         )
     return size - HEADER.size, kind
 
@@ -243,7 +244,8 @@ def decode_packet(kind: int, body: bytes) -> Packet:
         return _decode(kind, body)
     except struct.error:
         raise ProtocolError(
-            f"An emScon packet of type {kind} is too short: {len(body) + HEADER.size} bytes, {body[:16].hex(' ')}"
+            f"An emScon packet of type {kind} is too short: {len(body) + HEADER.size} bytes, {body[:16].hex(' ')}",
+            code="protocol.reply.length",
         ) from None
 
 
@@ -267,7 +269,8 @@ def _points(kind: int, body: bytes, start: int, count: int) -> Iterator[Mapping[
     size = layout.packed.size
     if not 0 <= count == (len(body) - start) // size:
         raise ProtocolError(
-            f"Expected a packet of {count} points with {size} bytes each; found {len(body) - start} bytes"
+            f"Expected a packet of {count} points with {size} bytes each; found {len(body) - start} bytes",
+            code="protocol.reply.length",
         )
     for offset in range(start, start + count * size, size):
         yield layout.unpack(body, offset)
@@ -289,9 +292,13 @@ def decode_command(data: bytes) -> tuple[int, dict[str, Any]]:
         (number,) = struct.unpack_from("<I", data, HEADER.size)
         values = COMMANDS[number].request.unpack(data, HEADER.size + 4) if number in COMMANDS else {}
     except struct.error:
-        raise ProtocolError(f"Expected a complete command; found {data.hex(' ')}") from None
+        raise ProtocolError(
+            f"Expected a complete command; found {data.hex(' ')}", code="protocol.request.form"
+        ) from None
     if kind != COMMAND:
-        raise ProtocolError(f"Expected a command, that is type {COMMAND}; found type {kind}")
+        raise ProtocolError(
+            f"Expected a command, that is type {COMMAND}; found type {kind}", code="protocol.request.form"
+        )
     return number, values
 
 

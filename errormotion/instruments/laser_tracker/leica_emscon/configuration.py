@@ -79,7 +79,8 @@ def verify(link: Link) -> None:
             raise InstrumentError(
                 f"{link.url} answers {codec.COMMANDS[number].name} with {differing}; expected "
                 f"{ {name: expected[name] for name in differing} }, as configured. Another client has changed it: end "
-                "the other client, then call configure() or open the tracker again"
+                "the other client, then call configure() or open the tracker again",
+                code="tracker.settings.differ",
             )
 
 

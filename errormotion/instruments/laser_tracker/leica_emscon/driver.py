@@ -129,7 +129,10 @@ class LeicaEmScon(EmSconSession):
         """Select a reflector by its name; the InstrumentError for another name lists the defined ones."""
         known = {each.name: each.number for each in self.reflectors()}
         if name not in known:
-            raise InstrumentError(f"{self.address} has the reflectors {', '.join(known) or 'none'}; found '{name}'")
+            raise InstrumentError(
+                f"{self.address} has the reflectors {', '.join(known) or 'none'}; found '{name}'",
+                code="tracker.reflector.unknown",
+            )
         self._query(codec.SET_REFLECTOR, number=known[name])
 
     def direction(self) -> tuple[float, float]:
@@ -261,7 +264,8 @@ class LeicaEmScon(EmSconSession):
         if self.settings.tracker == "AT4xx":
             raise InstrumentError(
                 "An AT4xx measures point by point and has no stream of distances; use measure(), or set "
-                'tracker = "AT901" for another tracker'
+                'tracker = "AT901" for another tracker',
+                code="tracker.stream.none",
             )
         if self._link.broken:
             self._reacquire()

@@ -40,6 +40,8 @@ MARKERS = (GET_SYSTEM_STATUS, GET_UNITS, GET_COORDINATES)
 class RefusedError(InstrumentError):
     """The server refuses a command; ``status`` is the number of the reason."""
 
+    code = "instrument.refused"
+
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
         self.status = status
@@ -185,7 +187,8 @@ class Link:
         except InstrumentTimeoutError as error:
             raise InstrumentTimeoutError(
                 f"{error}, after another command had no answer. Check the server, or close the connection and open it "
-                "again"
+                "again",
+                code=error.code,
             ) from None
         except RefusedError as error:
             if error.status == statuses.BUSY:
@@ -214,7 +217,9 @@ class Link:
             packet = self.next_packet(max(end - time.monotonic(), 0.0))
             if packet is None:
                 self._unanswered.add(number)
-                error = InstrumentTimeoutError(f"{self._transport.url}: no answer to {what} within {limit:g} s")
+                error = InstrumentTimeoutError(
+                    f"{self._transport.url}: no answer to {what} within {limit:g} s", code="instrument.no_answer"
+                )
                 raise after_others(error, others, what)
             if wanted(packet):
                 return packet
@@ -260,7 +265,8 @@ class Link:
         if self._lost:
             raise InstrumentError(
                 f"The connection to {self._transport.url} cannot be used after this error: {self._lost}. Close it and "
-                "open it again"
+                "open it again",
+                code="connection.lost",
             )
 
     def _note(self, packet: Packet) -> None:

@@ -43,7 +43,9 @@ class EmSconSession(Driver):
     def _link(self) -> Link:
         if self._connection is None or self._transport is None:
             self.transport  # noqa: B018 - raises before open
-            raise InstrumentError(f"The connection to {self.address} is closed; open it again")
+            raise InstrumentError(
+                f"The connection to {self.address} is closed; open it again", code="connection.closed"
+            )
         return self._connection
 
     def _query(self, number: int, /, *, limit: float | None = None, **values: Any) -> Packet:
@@ -59,7 +61,7 @@ class EmSconSession(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
+            raise InstrumentError(f"{self.info.id} is streaming; close the stream first", code="stream.running")
 
     def _start_session(self) -> None:
         self._last, self._resets = None, 0

@@ -51,7 +51,8 @@ def points(link: Link, settings: EmSconSettings, block: int | None = None) -> It
             if not 0 <= index - expected <= MAX_GAP * settings.rate:
                 raise ProtocolError(
                     f"The tracker's clock jumps from point {expected - 1} to point {index}: expected steps of one, "
-                    f"{settings.interval} ms apart. Check that no other client is measuring"
+                    f"{settings.interval} ms apart. Check that no other client is measuring",
+                    code="protocol.counter.jump",
                 )
             waiting.extend([(np.nan, BROKEN if link.breaks > breaks else LOST)] * (index - expected))
             expected, breaks = index + 1, link.breaks
@@ -77,4 +78,6 @@ def _next_points(link: Link, timeout: float) -> Sequence[Mapping[str, Any]]:
             return packet.points
     if link.broken:
         raise BeamBrokenError(f"The beam has been broken for {timeout:g} s")
-    raise InstrumentTimeoutError(f"No points of a continuous measurement for {timeout:g} s")
+    raise InstrumentTimeoutError(
+        f"No points of a continuous measurement for {timeout:g} s", code="instrument.no_answer"
+    )

@@ -11,6 +11,8 @@ from errormotion.errors import InstrumentError
 class BeamBrokenError(InstrumentError):
     """The beam has no reflector, and the search found none."""
 
+    code = "tracker.beam.broken"
+
 
 @dataclass(frozen=True)
 class Reflector:
@@ -33,7 +35,8 @@ def polar(position: tuple[float, float, float]) -> tuple[float, float, float]:
     values = tuple(float(x) for x in position)
     if len(values) != 3 or not all(map(math.isfinite, values)) or not any(values):
         raise InstrumentError(
-            f"Expected a position x, y, z in the tracker's frame, m, other than the origin; found {position!r}"
+            f"Expected a position x, y, z in the tracker's frame, m, other than the origin; found {position!r}",
+            code="position.form",
         )
     x, y, z = values
     return math.atan2(y, x), math.atan2(math.hypot(x, y), z), math.hypot(x, y, z)

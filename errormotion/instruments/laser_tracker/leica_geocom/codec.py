@@ -54,7 +54,10 @@ class Reply:
             return float(int(text, 16))
         value = float(text) if _NUMBER.fullmatch(text) else math.nan
         if not math.isfinite(value):
-            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a number; found {text[:40]!r}")
+            raise ProtocolError(
+                f"Value {index + 1} of a GeoCOM reply: expected a number; found {text[:40]!r}",
+                code="protocol.reply.number_form",
+            )
         return value
 
     def whole(self, index: int) -> int:
@@ -65,19 +68,28 @@ class Reply:
         if _HEX.fullmatch(text):
             return int(text, 16)
         if not _WHOLE.fullmatch(text):
-            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a whole number; found {text[:40]!r}")
+            raise ProtocolError(
+                f"Value {index + 1} of a GeoCOM reply: expected a whole number; found {text[:40]!r}",
+                code="protocol.reply.number_form",
+            )
         return int(text)
 
     def text(self, index: int) -> str:
         """Return a string without its quotation marks; ProtocolError if it is invalid."""
         text = self._value(index)
         if len(text) < 2 or text[0] != '"' or text[-1] != '"':
-            raise ProtocolError(f"Value {index + 1} of a GeoCOM reply: expected a string; found {text[:40]!r}")
+            raise ProtocolError(
+                f"Value {index + 1} of a GeoCOM reply: expected a string; found {text[:40]!r}",
+                code="protocol.reply.form",
+            )
         return _ESCAPE.sub(lambda found: chr(int(found[1], 16)) if found[1] else found[2], text[1:-1])
 
     def _value(self, index: int) -> str:
         if index >= len(self.values):
-            raise ProtocolError(f"A GeoCOM reply has {len(self.values)} values; expected at least {index + 1}")
+            raise ProtocolError(
+                f"A GeoCOM reply has {len(self.values)} values; expected at least {index + 1}",
+                code="protocol.reply.length",
+            )
         return self.values[index]
 
 
@@ -90,7 +102,9 @@ def request(call: int, transaction: int, *parameters: int | float) -> bytes:
         A parameter is not finite.
     """
     if not all(math.isfinite(each) for each in parameters):
-        raise InstrumentError(f"GeoCOM call {call}: expected finite parameters; found {parameters}")
+        raise InstrumentError(
+            f"GeoCOM call {call}: expected finite parameters; found {parameters}", code="request.not_finite"
+        )
     values = ",".join(str(each) if isinstance(each, int) else _decimal(each) for each in parameters)
     return f"%R1Q,{call},{transaction}:{values}".encode("ascii") + LINE_END
 
@@ -118,13 +132,16 @@ def reply(line: bytes) -> Reply:
         The line is not a GeoCOM reply, or is longer than ``MAX_REPLY``.
     """
     if len(line) > MAX_REPLY:
-        raise ProtocolError(f"A GeoCOM reply of {len(line)} bytes; expected at most {MAX_REPLY}")
+        raise ProtocolError(
+            f"A GeoCOM reply of {len(line)} bytes; expected at most {MAX_REPLY}", code="protocol.reply.too_long"
+        )
     text = line.decode("latin-1").rstrip("\r\n").lstrip("\n")
     found = _REPLY.fullmatch(text)
     if found is None:
         raise ProtocolError(
             f"Expected a GeoCOM reply, '%R1P,code,number:code,...'; found {text[:60]!r}. Check that the interface of "
-            "the station is set to GeoCOM"
+            "the station is set to GeoCOM",
+            code="protocol.reply.form",
         )
     communication, transaction, code, values = found.groups()
     return Reply(int(communication), int(transaction or 0), int(code), _fields(values))
@@ -138,7 +155,9 @@ def _fields(values: str | None) -> tuple[str, ...]:
         found = _FIELD.match(values, start)
         end = start if found is None else found.end()
         if found is None or (end < len(values) and values[end] != ","):
-            raise ProtocolError(f"A GeoCOM reply has an incomplete value: {values[start : start + 40]!r}")
+            raise ProtocolError(
+                f"A GeoCOM reply has an incomplete value: {values[start : start + 40]!r}", code="protocol.reply.form"
+            )
         fields.append(found[0])
         if end == len(values):
             return tuple(fields)
@@ -149,5 +168,6 @@ def check(call: int, found: Reply) -> None:
     """Raise InstrumentError if the communication failed: the call was not executed."""
     if found.communication:
         raise InstrumentError(
-            f"GeoCOM call {codes.name(call)} failed: code {found.communication}, {codes.text(found.communication)}"
+            f"GeoCOM call {codes.name(call)} failed: code {found.communication}, {codes.text(found.communication)}",
+            code="instrument.refused",
         )

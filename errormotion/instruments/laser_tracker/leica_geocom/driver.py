@@ -101,7 +101,8 @@ class LeicaGeoCom(Driver):
                 if recorded and not others:
                     raise ProtocolError(
                         f"{self.address}: expected a GeoCOM reply to {call}; found {recorded} lines of GSI and none of "
-                        "GeoCOM. Check that the interface of the station is set to GeoCOM"
+                        "GeoCOM. Check that the interface of the station is set to GeoCOM",
+                        code="protocol.reply.other",
                     ) from None
                 raise after_others(error, others, f"GeoCOM call {call}") from None
             if codec.is_gsi(text):
@@ -118,7 +119,8 @@ class LeicaGeoCom(Driver):
         codec.check(call, found)
         if found.code != codes.OK:
             raise InstrumentError(
-                f"{self.address} refuses GeoCOM call {codes.name(call)}: code {found.code}, {codes.text(found.code)}"
+                f"{self.address} refuses GeoCOM call {codes.name(call)}: code {found.code}, {codes.text(found.code)}",
+                code="instrument.refused",
             )
         return found
 
@@ -178,7 +180,8 @@ class LeicaGeoCom(Driver):
         given = environment.temperature, environment.pressure, environment.humidity
         if not (-60.0 <= given[0] <= 60.0 and 5e4 <= given[1] <= 1.1e5 and 0.0 <= given[2] <= 100.0):
             raise InstrumentError(
-                f"Expected the air for {self.address}: -60 to 60 degC, 50000 to 110000 Pa, 0 to 100 %; found {given}"
+                f"Expected the air for {self.address}: -60 to 60 degC, 50000 to 110000 Pa, 0 to 100 %; found {given}",
+                code="tracker.air.outside",
             )
         wavelength = self._request(codes.GET_AIR).number(0)
         wet = air.wet_temperature(given[0], given[2], given[1])
@@ -198,7 +201,9 @@ class LeicaGeoCom(Driver):
         found = self._call(call, codes.INCLINATION[self.settings.inclination])
         codec.check(call, found)
         if found.code not in (codes.OK, *codes.WARNINGS):
-            raise InstrumentError(f"{self.address} has no angles: code {found.code}, {codes.text(found.code)}")
+            raise InstrumentError(
+                f"{self.address} has no angles: code {found.code}, {codes.text(found.code)}", code="tracker.no_angles"
+            )
         return math.remainder(-found.number(0), math.tau), found.number(1)
 
     # ------------------------------------------------------------------ moving
@@ -217,19 +222,23 @@ class LeicaGeoCom(Driver):
             ``move`` is not set, the target is not a position, or the station refuses or finds no reflector.
         """
         if reason := self._point_at(target):
-            raise InstrumentError(f"{self.address} found no reflector near {target}: {reason}")
+            raise InstrumentError(
+                f"{self.address} found no reflector near {target}: {reason}", code="tracker.reflector.not_found"
+            )
 
     def _point_at(self, target: tuple[float, float, float]) -> str:
         """Turn to a position; return why no reflector was found, empty if one was found."""
         if not self.settings.move:
             raise InstrumentError(
                 f"{self.address} is not armed: set 'move = true' to permit the driver to turn the station, or point it "
-                "by hand and measure without a target"
+                "by hand and measure without a target",
+                code="instrument.not_armed",
             )
         x, y, z = (float(each) for each in target)
         if not math.isfinite(x + y + z) or x == y == z == 0.0:
             raise InstrumentError(
-                f"Expected a position x, y, z in the station's frame, m, other than the origin; found {target!r}"
+                f"Expected a position x, y, z in the station's frame, m, other than the origin; found {target!r}",
+                code="position.form",
             )
         horizontal, zenith = -math.atan2(y, x) % math.tau, math.atan2(math.hypot(x, y), z)
         limit, radius = self.settings.motion_timeout, self.settings.search_angle
@@ -244,7 +253,8 @@ class LeicaGeoCom(Driver):
             if found.code != codes.OK:
                 raise InstrumentError(
                     f"{self.address} refuses GeoCOM call {codes.name(call)}: code {found.code}, "
-                    f"{codes.text(found.code)}"
+                    f"{codes.text(found.code)}",
+                    code="instrument.refused",
                 )
         return ""
 
@@ -305,7 +315,10 @@ class LeicaGeoCom(Driver):
             if found.code in (codes.OK, *codes.WARNINGS, *codes.NO_DISTANCE):
                 return found
             if found.code != codes.BUSY or time.monotonic() > deadline:
-                raise InstrumentError(f"{self.address} does not measure: code {found.code}, {codes.text(found.code)}")
+                raise InstrumentError(
+                    f"{self.address} does not measure: code {found.code}, {codes.text(found.code)}",
+                    code="instrument.refused",
+                )
             time.sleep(BUSY_INTERVAL)
 
     def read(self) -> float:

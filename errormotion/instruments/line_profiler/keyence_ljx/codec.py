@@ -79,11 +79,13 @@ def request(opcode: int, arguments: bytes = b"", *, generation: str = "LJ-X8000"
 def parse_request(frame: bytes) -> tuple[int, bytes, str]:
     """Return opcode, arguments and generation of a request; ProtocolError if it is invalid."""
     if len(frame) < REQUEST_HEAD + 4:
-        raise ProtocolError(f"A request has at least {REQUEST_HEAD + 4} bytes; found {frame.hex(' ')}")
+        raise ProtocolError(
+            f"A request has at least {REQUEST_HEAD + 4} bytes; found {frame.hex(' ')}", code="protocol.request.form"
+        )
     length, variant, _, size = struct.unpack_from("<I4sII", frame)
     names = [name for name, number in GENERATIONS.items() if variant == bytes((number, 0, 0xF0, 0))]
     if not names or length + 4 != len(frame) or size != len(frame) - REQUEST_HEAD:
-        raise ProtocolError(f"Expected a request; found {frame[:32].hex(' ')}")
+        raise ProtocolError(f"Expected a request; found {frame[:32].hex(' ')}", code="protocol.request.form")
     return frame[REQUEST_HEAD], frame[REQUEST_HEAD + 4 :], names[0]
 
 
@@ -102,7 +104,8 @@ class Reply:
             return struct.unpack_from("<" + layout, self.data, offset)
         except struct.error:
             raise ProtocolError(
-                f"Expected a reply with {offset + struct.calcsize('<' + layout)} bytes of data; found {len(self.data)}"
+                f"Expected a reply with {offset + struct.calcsize('<' + layout)} bytes of data; found {len(self.data)}",
+                code="protocol.reply.length",
             ) from None
 
 
@@ -111,7 +114,9 @@ def reply_length(head: bytes) -> int:
     length: int = struct.unpack("<I", head)[0] + 4
     if not REPLY_HEAD <= length <= MAX_REPLY_BYTES:
         raise ProtocolError(
-            f"A reply has {REPLY_HEAD} to {MAX_REPLY_BYTES} bytes; found {length} (its first bytes are {head.hex(' ')})"
+            f"A reply has {REPLY_HEAD} to {MAX_REPLY_BYTES} bytes; found {length} (its first bytes are "
+            f"{head.hex(' ')})",
+            code="protocol.reply.length",
         )
     return length
 
@@ -122,12 +127,15 @@ def parse_reply(frame: bytes) -> Reply:
     A body length of 0 is accepted: the manufacturer's client does not read it.
     """
     if len(frame) < REPLY_HEAD or reply_length(frame[:4]) != len(frame):
-        raise ProtocolError(f"Expected a reply; found {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}")
+        raise ProtocolError(
+            f"Expected a reply; found {len(frame)} bytes, {frame[:REPLY_HEAD].hex(' ')}", code="protocol.reply.form"
+        )
     body: int = struct.unpack_from("<I", frame, BODY_LENGTH)[0]
     if body not in (0, len(frame) - BODY):
         raise ProtocolError(
             f"A reply of {len(frame)} bytes has a body of {len(frame) - BODY}; found the length {body} at byte "
-            f"{BODY_LENGTH}: {frame[:REPLY_HEAD].hex(' ')}"
+            f"{BODY_LENGTH}: {frame[:REPLY_HEAD].hex(' ')}",
+            code="protocol.reply.length",
         )
     return Reply(frame[RETURN_CODE], frame[PROGRAM], frame[REPLY_HEAD:], frame[COMMAND])
 
@@ -144,7 +152,8 @@ def reply(data: bytes = b"", *, code: int = 0, program: int = 0, command: int = 
 def refusal(opcode: int, code: int) -> InstrumentError:
     """Return the error for a return code."""
     return InstrumentError(
-        f"The profiler refuses request {opcode:02X}: error {0x8000 + code:04X} ({RETURN_CODES.get(code, 'unknown')})"
+        f"The profiler refuses request {opcode:02X}: error {0x8000 + code:04X} ({RETURN_CODES.get(code, 'unknown')})",
+        code="instrument.refused",
     )
 
 
@@ -263,7 +272,8 @@ def parse_layout(reply: Reply) -> StreamLayout:
     if not 0 < points <= MAX_POINTS or z_unit == 0:
         raise ProtocolError(
             f"Expected profiles of 1 to {MAX_POINTS} points with a Z unit; the profiler announces {points} points "
-            f"and the unit {z_unit}"
+            f"and the unit {z_unit}",
+            code="profiler.profile.form",
         )
     return StreamLayout(code, kind, points, z_unit * LENGTH, x_start * LENGTH, x_pitch * LENGTH)
 

@@ -71,7 +71,9 @@ class CommandLine:
             The bytes are not a reply to this request.
         """
         if not self.usable():
-            raise InstrumentError(f"The connection to {self._name} is lost ({self.lost}); close the stream")
+            raise InstrumentError(
+                f"The connection to {self._name} is lost ({self.lost}); close the stream", code="connection.lost"
+            )
         reply = self._exchange(opcode, arguments)
         if reply.code:
             raise codec.refusal(opcode, reply.code)
@@ -110,9 +112,13 @@ class CommandLine:
                 return reply
             if not reply.command:
                 raise ProtocolError(
-                    f"{self._transport.url}: a reply without the number of its command after a reply was missed"
+                    f"{self._transport.url}: a reply without the number of its command after a reply was missed",
+                    code="protocol.reply.number",
                 )
-        raise ProtocolError(f"{self._transport.url}: more than {MAX_STALE_REPLIES} replies to other commands")
+        raise ProtocolError(
+            f"{self._transport.url}: more than {MAX_STALE_REPLIES} replies to other commands",
+            code="protocol.reply.stale",
+        )
 
     def _frame(self) -> bytes:
         """Return one reply; the bytes of an incomplete reply are kept for the next call."""
@@ -133,6 +139,7 @@ class CommandLine:
             except InstrumentTimeoutError:
                 raise InstrumentTimeoutError(
                     f"{self._transport.url}: expected {stop - start} bytes within {self._timeout:g} s; received "
-                    f"{len(self._partial) - start}"
+                    f"{len(self._partial) - start}",
+                    code="instrument.no_answer",
                 ) from None
         return self._partial[:stop]

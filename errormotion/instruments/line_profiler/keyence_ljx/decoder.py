@@ -32,6 +32,8 @@ length."""
 class StreamEndedError(InstrumentError):
     """The profiler has ended the stream."""
 
+    code = "stream.ended"
+
 
 class StreamDecoder:
     """Converts the bytes of one stream, however they are split, to packed profiles.
@@ -85,7 +87,8 @@ class StreamDecoder:
                 if len(self._rest) > UNSYNCHRONISED_PROFILES * self._size * WORD:
                     return ProtocolError(
                         f"No profile of {self._size} words with a valid checksum in {len(self._rest)} bytes. Check "
-                        "that no settings were changed during the stream. Start the stream again"
+                        "that no settings were changed during the stream. Start the stream again",
+                        code="profiler.stream.damaged",
                     )
                 return None
             words = np.frombuffer(self._rest, dtype="<u4", count=len(self._rest) // WORD)
@@ -102,7 +105,8 @@ class StreamDecoder:
                 count = int(words[n * self._size + TRIGGER_WORD])
                 return ProtocolError(
                     f"The trigger count jumps from {self._trigger - 1} to {count}: it was reset, or the profiler was "
-                    "restarted. Start the stream again"
+                    "restarted. Start the stream again",
+                    code="profiler.trigger.jump",
                 )
             elif len(self._rest) < NOTIFY_WORDS * WORD:
                 return None

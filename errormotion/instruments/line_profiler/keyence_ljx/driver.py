@@ -92,7 +92,10 @@ class KeyenceLJX(Driver):
         """Return the models and serial numbers of the controller and its head."""
         units = codec.parse_description(self.command(codec.DESCRIBE))
         if not units:
-            raise InstrumentError(f"Expected the description of the controller at {self.address}; found none")
+            raise InstrumentError(
+                f"Expected the description of the controller at {self.address}; found none",
+                code="profiler.controller.missing",
+            )
         model, serial = zip(*units, strict=True)
         return Identity(
             manufacturer="Keyence",
@@ -125,10 +128,15 @@ class KeyenceLJX(Driver):
         """Activate another program."""
         self._refuse_while_streaming()
         if not 0 <= number < codec.PROGRAMS:
-            raise InstrumentError(f"Expected the number of a program, 0 to {codec.PROGRAMS - 1}; found {number}")
+            raise InstrumentError(
+                f"Expected the number of a program, 0 to {codec.PROGRAMS - 1}; found {number}",
+                code="profiler.program.number",
+            )
         self.command(codec.CHANGE_PROGRAM, bytes((number, 0, 0, 0)))
         if (active := self.program()) != number:
-            raise InstrumentError(f"Program {number} was requested, but {active} is active")
+            raise InstrumentError(
+                f"Program {number} was requested, but {active} is active", code="profiler.program.other"
+            )
 
     def x_pitch(self) -> float:
         """Request the distance between points on the line, m."""
@@ -213,7 +221,7 @@ class KeyenceLJX(Driver):
         except InstrumentTimeoutError as error:
             if not self._line().answers:  # it does not answer commands either
                 raise
-            raise InstrumentTimeoutError(self._untriggered(refused)) from error
+            raise InstrumentTimeoutError(self._untriggered(refused), code="profiler.not_triggered") from error
 
     def _refusals(self) -> list[InstrumentError]:
         """Trigger one profile; return the refusal, if any."""
@@ -290,7 +298,9 @@ class KeyenceLJX(Driver):
             first = 0
             while True:
                 if self._reader is not reader:
-                    raise InstrumentError(f"{self.name}: this stream was closed; start another one")
+                    raise InstrumentError(
+                        f"{self.name}: this stream was closed; start another one", code="stream.closed"
+                    )
                 parts, skipped = self._block(rows, unpack, layout, size)
                 yield Profiles(
                     first=first,
@@ -379,4 +389,4 @@ class KeyenceLJX(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._reader is not None:
-            raise InstrumentError(f"{self.name} is streaming; close the stream first")
+            raise InstrumentError(f"{self.name} is streaming; close the stream first", code="stream.running")

@@ -80,10 +80,14 @@ class ProfileFiles(Openable):
             self._files = _read_list(Path(rest))
             return
         if mark and scheme != "file":
-            raise InstrumentError(f"Expected a file or a pattern such as scans/*.ply; found '{self.address}'")
+            raise InstrumentError(
+                f"Expected a file or a pattern such as scans/*.ply; found '{self.address}'", code="scans.address.form"
+            )
         paths = [Path(rest)] if Path(rest).is_file() else [Path(name) for name in sorted(glob(rest))]
         if not paths:
-            raise InstrumentError(f"Expected scans of {', '.join(sorted(READERS))}; found no file '{rest}'")
+            raise InstrumentError(
+                f"Expected scans of {', '.join(sorted(READERS))}; found no file '{rest}'", code="scans.not_found"
+            )
         files = {path: _hash(path) for path in paths}
         if self._record is not None:
             _write_list(self._record, files)
@@ -136,7 +140,8 @@ class ProfileFiles(Openable):
     def _opened(self) -> dict[Path, str]:
         if self._files is None:
             raise InstrumentError(
-                f"The profile_files at {self.address} are not open: use them in a 'with' block, or call open() first"
+                f"The profile_files at {self.address} are not open: use them in a 'with' block, or call open() first",
+                code="instrument.not_open",
             )
         return self._files
 
@@ -147,9 +152,9 @@ def _hash(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}", code="scans.file.unreadable") from None
     except ValueError as error:  # a name with the character NUL
-        raise InstrumentError(f"{str(path)!r} is not a file name: {error}") from None
+        raise InstrumentError(f"{str(path)!r} is not a file name: {error}", code="scans.file.name") from None
 
 
 def _write_list(path: Path, files: dict[Path, str]) -> None:
@@ -158,7 +163,9 @@ def _write_list(path: Path, files: dict[Path, str]) -> None:
         with path.open("x", encoding="utf-8") as out:
             out.write("\n".join(lines) + "\n")
     except OSError as error:
-        raise InstrumentError(f"The recording {path} cannot be created: {error.strerror}") from None
+        raise InstrumentError(
+            f"The recording {path} cannot be created: {error.strerror}", code="recording.not_created"
+        ) from None
 
 
 def _read_list(path: Path) -> dict[Path, str]:
@@ -166,12 +173,15 @@ def _read_list(path: Path) -> dict[Path, str]:
         require_regular(path)
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ReplayError(f"The recording {path} cannot be read: {error}") from None
+        raise ReplayError(f"The recording {path} cannot be read: {error}", code="recording.unreadable") from None
     pairs = [line.partition(" ") for line in lines[1:]]
     if not pairs or lines[0] != FORMAT or not all(name for _, _, name in pairs):
-        raise ReplayError(f"{path} is not a list of scans: expected a first line '{FORMAT}' and at least one file")
+        raise ReplayError(
+            f"{path} is not a list of scans: expected a first line '{FORMAT}' and at least one file",
+            code="recording.form",
+        )
     files = {path.parent / name: digest for digest, _, name in pairs}
     for file, digest in files.items():
         if _hash(file) != digest:
-            raise ReplayError(f"{file} has changed since it was recorded in {path}")
+            raise ReplayError(f"{file} has changed since it was recorded in {path}", code="recording.file.changed")
     return files

@@ -32,28 +32,38 @@ def read_scan(path: Path, settings: ProfileFileSettings) -> Scan:
     """
     suffix = path.suffix.lower()
     if suffix not in READERS:
-        raise InstrumentError(f"{path}: expected a file of one of {', '.join(sorted(READERS))}")
+        raise InstrumentError(
+            f"{path}: expected a file of one of {', '.join(sorted(READERS))}", code="scans.file.ending"
+        )
     if not path.is_file():
-        raise InstrumentError(f"{path}: file not found")
+        raise InstrumentError(f"{path}: file not found", code="scans.not_found")
     heights, x, y = READERS[suffix](path, settings)
     if not np.isfinite(heights).any():
-        raise InstrumentError(f"{path}: expected heights; found none. Check that the file is complete")
+        raise InstrumentError(
+            f"{path}: expected heights; found none. Check that the file is complete", code="scans.no_heights"
+        )
     highest = float(np.nanmax(np.abs(heights)))
     if highest > MAX_HEIGHT:
-        raise InstrumentError(f"{path}: found a height of {highest:.4g} m; check its unit '{settings.unit or 'm'}'")
+        raise InstrumentError(
+            f"{path}: found a height of {highest:.4g} m; check its unit '{settings.unit or 'm'}'",
+            code="scans.unit.implausible",
+        )
     for name, positions in (("y", y), ("x", x)):
         steps = np.diff(positions)
         if not (np.isfinite(positions).all() and ((steps > 0).all() or (steps < 0).all())):
             raise InstrumentError(
                 f"{path}: {name} is not monotonic: expected profiles and points in order; split the file where the "
-                "feed reverses"
+                "feed reverses",
+                code="scans.order",
             )
     return Scan(path, np.ascontiguousarray(heights), x, y)
 
 
 def _unit(path: Path, settings: ProfileFileSettings) -> str:
     if settings.unit is None:
-        raise InstrumentError(f"{path} has no unit of lengths: set 'unit' to m, mm, um or inch")
+        raise InstrumentError(
+            f"{path} has no unit of lengths: set 'unit' to m, mm, um or inch", code="scans.unit.missing"
+        )
     return settings.unit
 
 
@@ -66,7 +76,8 @@ def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
     unit = _unit(path, settings)
     if settings.x_pitch is None or settings.y_pitch is None:
         raise InstrumentError(
-            f"{path} only has heights: set 'x_pitch' and 'y_pitch', the distances of its columns and rows"
+            f"{path} only has heights: set 'x_pitch' and 'y_pitch', the distances of its columns and rows",
+            code="scans.pitch.missing",
         )
     heights = _in_metres(_with_nan(_csv_rows(path, settings.delimiter), settings), unit)
     n, points = heights.shape
@@ -89,21 +100,22 @@ def _csv_rows(path: Path, delimiter: str) -> Array:
                 lines.append((number, len(cells) > 1 and not cells[-1]))
     except UnicodeDecodeError as error:
         raise InstrumentError(
-            f"{path}, after line {number}: byte {error.object[error.start]:#x} is not UTF-8"
+            f"{path}, after line {number}: byte {error.object[error.start]:#x} is not UTF-8", code="scans.encoding"
         ) from None
     except ValueError as error:
-        raise InstrumentError(f"{path}, line {number}: {error}") from None
+        raise InstrumentError(f"{path}, line {number}: {error}", code="scans.line.form") from None
     except OSError as error:
-        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}", code="scans.file.unreadable") from None
     if not rows:
-        raise InstrumentError(f"{path}: expected heights; found none")
+        raise InstrumentError(f"{path}: expected heights; found none", code="scans.no_heights")
     longest = max(map(len, rows))
     if all(ended for row, (_, ended) in zip(rows, lines, strict=True) if len(row) == longest):
         rows = [row[: longest - 1] for row in rows]
     for row, (number, _) in zip(rows, lines, strict=True):
         if len(row) != len(rows[0]):
             raise InstrumentError(
-                f"{path}, line {number}: expected {len(rows[0])} cells as in the lines before; found {len(row)}"
+                f"{path}, line {number}: expected {len(rows[0])} cells as in the lines before; found {len(row)}",
+                code="scans.line.cells",
             )
     return np.array(rows)
 
@@ -120,17 +132,21 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
             check_netcdf(path)
             dataset = xr.load_dataset(path, engine="h5netcdf", decode_times=False, decode_timedelta=False)
     except DatasetError as error:
-        raise InstrumentError(f"{path} cannot be read as NetCDF: {error.__cause__ or error}") from None
+        raise InstrumentError(
+            f"{path} cannot be read as NetCDF: {error.__cause__ or error}", code="scans.file.unreadable"
+        ) from None
     found = []
     for name, dims in (("height", ("profile", "point")), ("x", ("point",)), ("y", ("profile",))):
         if name not in dataset.variables or set(dataset[name].dims) != set(dims):
-            raise InstrumentError(f"{path}: expected a variable {name}({', '.join(dims)})")
+            raise InstrumentError(
+                f"{path}: expected a variable {name}({', '.join(dims)})", code="scans.variable.missing"
+            )
         variable = dataset[name].transpose(*dims)
         unit = str(variable.attrs.get("units", ""))
         if not unit:
-            raise InstrumentError(f"{path}: the variable {name} has no attribute 'units'")
+            raise InstrumentError(f"{path}: the variable {name} has no attribute 'units'", code="scans.unit.missing")
         if variable.dtype.kind not in "iuf":
-            raise InstrumentError(f"{path}: the variable {name} is not numeric")
+            raise InstrumentError(f"{path}: the variable {name} is not numeric", code="scans.variable.type")
         values = np.asarray(variable.values, dtype=np.float64)
         found.append(_in_metres(_with_nan(values, settings) if name == "height" else values, unit))
     heights, x, y = found
@@ -145,7 +161,9 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         cloud = open3d.t.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     if "positions" not in cloud.point or not len(cloud.point.positions):
-        raise InstrumentError(f"{path} cannot be read: Open3D found no points. Check that the file is complete")
+        raise InstrumentError(
+            f"{path} cannot be read: Open3D found no points. Check that the file is complete", code="scans.file.damaged"
+        )
     points = cloud.point.positions.numpy().astype(np.float64)
     points[:, 2] = _with_nan(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
@@ -159,13 +177,13 @@ def _read_xyz(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
     unit = _unit(path, settings)
     lines = _text(path).splitlines()
     if not any(line.strip() and not line.lstrip().startswith(_COMMENTS) for line in lines):
-        raise InstrumentError(f"{path}: expected points; found none")
+        raise InstrumentError(f"{path}: expected points; found none", code="scans.no_points")
     try:
         points = np.loadtxt(lines, comments=_COMMENTS, ndmin=2, dtype=np.float64)
     except ValueError:
         points = np.empty((0, 0))
     if points.shape[1:] != (3,):
-        raise InstrumentError(f"{path}, {_first_mistake(lines)}")
+        raise InstrumentError(f"{path}, {_first_mistake(lines)}", code="scans.line.form")
     points[:, 2] = _with_nan(points[:, 2], settings)
     return height_map(_in_metres(points, unit), path)
 
@@ -180,9 +198,11 @@ def _text(path: Path) -> str:
         data = path.read_bytes()
         return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InstrumentError(f"{path}: expected a text in UTF-8 or UTF-16; {error.reason}") from None
+        raise InstrumentError(
+            f"{path}: expected a text in UTF-8 or UTF-16; {error.reason}", code="scans.encoding"
+        ) from None
     except OSError as error:
-        raise InstrumentError(f"{path} cannot be read: {error.strerror}") from None
+        raise InstrumentError(f"{path} cannot be read: {error.strerror}", code="scans.file.unreadable") from None
 
 
 def _first_mistake(lines: Sequence[str]) -> str:
@@ -210,7 +230,9 @@ def _open3d(path: Path) -> Any:
     try:
         import open3d
     except (ImportError, OSError) as error:
-        raise InstrumentError(f"Reading {path} requires Open3D, which cannot be loaded: {error}") from None
+        raise InstrumentError(
+            f"Reading {path} requires Open3D, which cannot be loaded: {error}", code="scans.reader.missing"
+        ) from None
     return open3d
 
 
@@ -250,14 +272,19 @@ def check_complete(path: Path) -> None:
                     text, width = kind == "ascii", width if kind == "binary" else 0
                     break
         else:
-            raise InstrumentError(f"{path} cannot be read: its header has no end. Check that the file is complete")
+            raise InstrumentError(
+                f"{path} cannot be read: its header has no end. Check that the file is complete",
+                code="scans.file.damaged",
+            )
         found = stated
         if text:
             found = _whole_lines(file)
         elif width:
             found = (path.stat().st_size - file.tell()) // width
     if found < stated:
-        raise InstrumentError(f"{path} cannot be read: its header states {stated} points; found {found}")
+        raise InstrumentError(
+            f"{path} cannot be read: its header states {stated} points; found {found}", code="scans.file.damaged"
+        )
 
 
 def _whole_lines(file: Iterable[bytes]) -> int:
@@ -279,16 +306,19 @@ def height_map(points: Array, path: Path) -> tuple[Array, Array, Array]:
     """
     points = points[np.isfinite(points[:, :2]).all(axis=1)]
     if not len(points):
-        raise InstrumentError(f"{path} is not a height map: no point has an x and a y")
+        raise InstrumentError(f"{path} is not a height map: no point has an x and a y", code="scans.no_height_map")
     (x, column), (y, row) = (_lines(points[:, axis]) for axis in (0, 1))
     if x.size * y.size * FULL > len(points):
         raise InstrumentError(
             f"{path} is not a height map: {len(points)} points have {x.size} different x and {y.size} different y; "
-            "expected profiles of equal y, with the same x on each"
+            "expected profiles of equal y, with the same x on each",
+            code="scans.no_height_map",
         )
     cells = row * x.size + column
     if np.unique(cells).size < cells.size:
-        raise InstrumentError(f"{path} is not a height map: several points have the same x and y")
+        raise InstrumentError(
+            f"{path} is not a height map: several points have the same x and y", code="scans.no_height_map"
+        )
     heights = np.full(x.size * y.size, np.nan)
     heights[cells] = points[:, 2]
     return heights.reshape(y.size, x.size), x, y
@@ -310,7 +340,7 @@ def _in_metres(values: Array, unit: str) -> Array:
     try:
         return np.asarray(convert(values, unit, "m"))
     except DatasetError as error:
-        raise InstrumentError(f"Expected lengths: {error}") from None
+        raise InstrumentError(f"Expected lengths: {error}", code="scans.unit.form") from None
 
 
 Reader = Callable[[Path, ProfileFileSettings], tuple[Array, Array, Array]]

@@ -87,7 +87,10 @@ def column(block: Block, channel: int) -> Array:
     """
     if channel not in block.channels:
         sent = ", ".join(map(str, block.channels))
-        raise InstrumentError(f"The controller sends the channels {sent}; expected channel {channel} among them")
+        raise InstrumentError(
+            f"The controller sends the channels {sent}; expected channel {channel} among them",
+            code="sensor.channel.missing",
+        )
     return np.asarray(block.values[:, block.channels.index(channel)])
 
 

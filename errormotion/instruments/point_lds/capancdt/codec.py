@@ -77,10 +77,14 @@ def answer_to(command: str, line: bytes) -> str:
     _, echo, rest = text.rpartition(f"${command}")
     for error in ERRORS:
         if error in rest:
-            raise InstrumentError(f"The controller refuses '${command}': {error[1:].lower()}")
+            raise InstrumentError(
+                f"The controller refuses '${command}': {error[1:].lower()}", code="instrument.refused"
+            )
     without_ok = command == VERSION and rest  # the manuals print this answer without OK (6200 p. 66)
     if not echo or not (rest.endswith("OK") or without_ok):
-        raise ProtocolError(f"Expected an answer to '${command}' that ends in 'OK'; found {text[:80]!r}")
+        raise ProtocolError(
+            f"Expected an answer to '${command}' that ends in 'OK'; found {text[:80]!r}", code="protocol.reply.form"
+        )
     return rest.removesuffix("OK")
 
 
@@ -96,7 +100,9 @@ def decode_text(line: bytes) -> str:
 def parse_number(command: str, text: str) -> int:
     """Return the whole number that is an answer."""
     if not re.fullmatch(r"\d{1,9}", text):
-        raise ProtocolError(f"Expected a number as the answer to '${command}'; found {text[:40]!r}")
+        raise ProtocolError(
+            f"Expected a number as the answer to '${command}'; found {text[:40]!r}", code="protocol.reply.number_form"
+        )
     return int(text)
 
 
@@ -104,7 +110,10 @@ def parse_sample_time(command: str, text: str) -> float:
     """Return the sample time of an answer to STI, s: the actual one, which follows the requested one and a comma."""
     microseconds = parse_number(command, text.rpartition(",")[2])
     if microseconds == 0:
-        raise ProtocolError(f"Expected a sample time as the answer to '${command}'; found {text[:40]!r}")
+        raise ProtocolError(
+            f"Expected a sample time as the answer to '${command}'; found {text[:40]!r}",
+            code="protocol.reply.number_form",
+        )
     return microseconds * 1e-6
 
 
@@ -119,7 +128,10 @@ def parse_fields(command: str, text: str) -> dict[str, str]:
     for part in text.removeprefix(":").split(","):
         found = _FIELD.fullmatch(part.strip())
         if found is None:
-            raise ProtocolError(f"Expected fields such as 'NAM...' as the answer to '${command}'; found {text[:80]!r}")
+            raise ProtocolError(
+                f"Expected fields such as 'NAM...' as the answer to '${command}'; found {text[:80]!r}",
+                code="protocol.reply.form",
+            )
         fields[found[1]] = found[2].strip()
     return fields
 
@@ -159,21 +171,28 @@ def parse_channel(channel: int, text: str) -> Channel:
     fields = parse_fields(command, text)
     for name in ("RNG", "UNT"):
         if name not in fields:
-            raise ProtocolError(f"Expected a field {name} in the answer to '${command}'; found {text[:80]!r}")
+            raise ProtocolError(
+                f"Expected a field {name} in the answer to '${command}'; found {text[:80]!r}",
+                code="protocol.reply.field",
+            )
     unit = UNITS.get(fields["UNT"])
     if unit is None:
         raise ProtocolError(
-            f"Channel {channel} has its range in {fields['UNT'][:20]!r}; expected one of {', '.join(UNITS)}"
+            f"Channel {channel} has its range in {fields['UNT'][:20]!r}; expected one of {', '.join(UNITS)}",
+            code="protocol.reply.unit",
         )
     low, span = (_number(command, fields.get(name, "0")) * unit for name in ("OFS", "RNG"))
     if span <= 0:
         raise ProtocolError(
-            f"Channel {channel} states a measuring range of {fields['RNG']}; check that a sensor is assigned"
+            f"Channel {channel} states a measuring range of {fields['RNG']}; check that a sensor is assigned",
+            code="protocol.reply.range",
         )
     return Channel(fields.get("NAM", ""), fields.get("SNO", ""), low, span)
 
 
 def _number(command: str, text: str) -> float:
     if not _NUMBER.fullmatch(text):
-        raise ProtocolError(f"Expected a number in the answer to '${command}'; found {text[:40]!r}")
+        raise ProtocolError(
+            f"Expected a number in the answer to '${command}'; found {text[:40]!r}", code="protocol.reply.number_form"
+        )
     return float(text)

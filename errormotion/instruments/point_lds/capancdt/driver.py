@@ -100,7 +100,8 @@ class CapaNCDT(CountingDriver):
             found = "a mathematical function" if state == codec.MATHS else "none"
             raise InstrumentError(
                 f"{self.address}: expected a sensor at channel {number}; found {found}. "
-                f"States of the channels: {', '.join(map(str, states))}"
+                f"States of the channels: {', '.join(map(str, states))}",
+                code="sensor.channel.missing",
             )
         channel = codec.parse_channel(number, self._query(codec.channel_request(number)))
         where, remedy = f" at channel {number}", "assign the sensor in the controller"
@@ -125,7 +126,8 @@ class CapaNCDT(CountingDriver):
         block = self._requested_block()
         if not block.intact:
             raise ProtocolError(
-                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again"
+                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again",
+                code="protocol.reading.damaged",
             )
         values, codes = scale(column(block, self.settings.channel)[-1:], channel.offset, channel.measuring_range)
         self.no_value = REASONS[int(codes[0])]
@@ -178,7 +180,7 @@ class CapaNCDT(CountingDriver):
     def _ready(self) -> codec.Channel:
         self.transport  # noqa: B018 - raises before open
         if self._channel is None:
-            raise InstrumentError(f"{self.address}: the controller has not been set up")
+            raise InstrumentError(f"{self.address}: the controller has not been set up", code="sensor.not_set_up")
         return self._channel
 
     def _query(self, command: str) -> str:

@@ -74,7 +74,8 @@ def _plausible(flags: int, one: int, other: int) -> bool:
 def _other_values(flags: int, others: int, size: int) -> InstrumentError:
     return InstrumentError(
         f"The controller sends frames of {size} bytes (flags {flags:08X} and {others:08X}); expected one distance of "
-        f"{BYTES_OF_VALUE} bytes. Select the measurement program 'distance' and linearized values on its web page"
+        f"{BYTES_OF_VALUE} bytes. Select the measurement program 'distance' and linearized values on its web page",
+        code="sensor.output.form",
     )
 
 

@@ -54,7 +54,8 @@ def model_of(facts: dict[str, str]) -> str:
     name = facts.get("name", "")
     if not name.startswith(MODELS):
         raise InstrumentError(
-            f"The controller states the name '{name[:40]}'; expected {', '.join(MODELS)}, since others differ"
+            f"The controller states the name '{name[:40]}'; expected {', '.join(MODELS)}, since others differ",
+            code="sensor.model.unknown",
         )
     return name
 
@@ -69,7 +70,10 @@ def range_of(facts: dict[str, str]) -> float:
     """
     found = reported_range(facts)
     if found is None:
-        raise ProtocolError(f"Expected 'Measuring range' in the answer to {SENSOR}; found {', '.join(facts)[:80]!r}")
+        raise ProtocolError(
+            f"Expected 'Measuring range' in the answer to {SENSOR}; found {', '.join(facts)[:80]!r}",
+            code="protocol.reply.field",
+        )
     return found
 
 
@@ -77,7 +81,9 @@ def rate_of(lines: Sequence[str]) -> float:
     """Return the measuring rate, Hz, from an answer to MEASRATE in kHz (p. 102)."""
     rate = _number(RATE, lines) * 1000.0
     if not 0 < rate <= 10 * RATES[1]:
-        raise ProtocolError(f"Expected a measuring rate up to {RATES[1]:g} Hz; found {rate:g} Hz")
+        raise ProtocolError(
+            f"Expected a measuring rate up to {RATES[1]:g} Hz; found {rate:g} Hz", code="protocol.reply.range"
+        )
     return rate
 
 
@@ -96,5 +102,8 @@ def _number(command: str, lines: Sequence[str]) -> float:
         setting(command, lines).split(" ")[1:] or " ".join(lines).split(" ")[:1]
     )  # with ECHO OFF the name is missing
     if not words or not _NUMBER.fullmatch(words[0]):
-        raise ProtocolError(f"Expected a number as the answer to '{command}'; found {' '.join(lines)[:80]!r}")
+        raise ProtocolError(
+            f"Expected a number as the answer to '{command}'; found {' '.join(lines)[:80]!r}",
+            code="protocol.reply.number_form",
+        )
     return float(words[0])

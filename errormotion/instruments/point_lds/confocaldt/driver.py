@@ -94,7 +94,8 @@ class ConfocalDT(CountingDriver):
         if setting(codec.MASTER, answer) != f"{codec.MASTER} NONE":
             raise InstrumentError(
                 f"{self.address}: a master value may be set (the answer is '{stated}'), so that values are not "
-                f"relative to the start of the range. Reset it: {codec.MASTER} NONE, or on the web page"
+                f"relative to the start of the range. Reset it: {codec.MASTER} NONE, or on the web page",
+                code="sensor.master.set",
             )
         if settings.rate is not None:
             dialogue.command(codec.rate_request(settings.rate))
@@ -116,7 +117,8 @@ class ConfocalDT(CountingDriver):
         block = self._one_block()
         if not block.intact:
             raise ProtocolError(
-                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again"
+                f"{self.address}: the block of a reading is incomplete, or stray bytes follow; read again",
+                code="protocol.reading.damaged",
             )
         values, codes = scale(block.values[:1, 0])
         self.no_value = REASONS[int(codes[0])]
@@ -161,7 +163,7 @@ class ConfocalDT(CountingDriver):
     def _commands(self) -> Dialogue:
         self.transport  # noqa: B018 - raises before open
         if self._dialogue is None:
-            raise InstrumentError(f"{self.address}: the controller has not been set up")
+            raise InstrumentError(f"{self.address}: the controller has not been set up", code="sensor.not_set_up")
         return self._dialogue
 
     # ------------------------------------------------------------------ opening and closing

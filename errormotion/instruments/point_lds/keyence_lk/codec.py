@@ -142,7 +142,7 @@ def decode(line: bytes) -> str:
     """
     body = line.rstrip(b"\r\n")
     if not all(0x20 <= byte < 0x7F for byte in body):
-        raise ProtocolError(f"Expected a line of ASCII; found {line!r}")
+        raise ProtocolError(f"Expected a line of ASCII; found {line!r}", code="protocol.text.form")
     return body.decode("ascii")
 
 
@@ -167,12 +167,16 @@ def parse_answer(request: str, text: str, header: str | None = None) -> str:
     """
     if (code := error_code(request, text)) is not None:
         meaning = ERRORS.get(code, "unknown code")
-        raise InstrumentError(f"The controller refuses '{request}' with error {code}: {meaning}")
+        raise InstrumentError(
+            f"The controller refuses '{request}' with error {code}: {meaning}", code="instrument.refused"
+        )
     expected = request if header is None else header
     if text == expected:
         return ""
     if not text.startswith(f"{expected},"):
-        raise ProtocolError(f"'{request}': expected an answer that starts with '{expected}'; found '{text}'")
+        raise ProtocolError(
+            f"'{request}': expected an answer that starts with '{expected}'; found '{text}'", code="protocol.reply.form"
+        )
     return text[len(expected) + 1 :]
 
 
@@ -204,7 +208,8 @@ def parse_value(text: str, display: Display) -> tuple[float, int]:
     if len(number[1]) != display.decimals:
         raise ProtocolError(
             f"Expected a value with {display.decimals} decimals, as in the settings; found '{text}'. The setting "
-            "'display' must be the smallest displayed unit of the controller"
+            "'display' must be the smallest displayed unit of the controller",
+            code="protocol.reply.decimals",
         )
     return float(text) * display.unit, 0
 
@@ -233,5 +238,6 @@ def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
     if needed > baudrate:
         raise InstrumentError(
             f"{rate:g} readings/s exceed {baudrate} baud: each takes {request} bytes of request and "
-            f"{answer} of answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate"
+            f"{answer} of answer, x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate or raise the baud rate",
+            code="sensor.rate.too_high",
         )

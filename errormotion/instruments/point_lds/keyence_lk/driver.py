@@ -117,7 +117,7 @@ class KeyenceLK(Driver):
             The rate exceeds the capacity of the line; the controller has another display unit or an offset, or refuses.
         """
         if self._streaming:
-            raise InstrumentError(f"{self.info.id} is streaming; close the stream first")
+            raise InstrumentError(f"{self.info.id} is streaming; close the stream first", code="stream.running")
         self._line_speed(settings)
         output = CONTROLLERS[settings.controller].output.format(settings.output)
         unit = str(DISPLAYS[settings.display].number)
@@ -241,13 +241,15 @@ class KeyenceLK(Driver):
             names = {str(display.number): name for name, display in DISPLAYS.items()}
             raise InstrumentError(
                 f"The setting 'display' is {settings.display}; the controller at {self.address} answers "
-                f"'{request}' with {names.get(found, found)!r}. Change one of them, or use set_up = \"set\""
+                f"'{request}' with {names.get(found, found)!r}. Change one of them, or use set_up = \"set\"",
+                code="sensor.display.differs",
             )
         request = f"SR,{OFFSET_SETTING},{output}"
         if set(found := self._query(request)) & set("123456789"):
             raise InstrumentError(
                 f"The controller at {self.address} has an offset of {found}, so that 0 is not the middle of the range. "
-                'Clear it, or use set_up = "set"'
+                'Clear it, or use set_up = "set"',
+                code="sensor.offset.set",
             )
 
     def _wait_for_interval(self, start: float, number: int) -> None:
@@ -259,7 +261,8 @@ class KeyenceLK(Driver):
         elif -ahead > self.settings.timeout:
             raise InstrumentError(
                 f"{self.address}: {self.rate:g} readings/s were requested, but {number} took "
-                f"{number / self.rate - ahead:.1f} s; lower the rate"
+                f"{number / self.rate - ahead:.1f} s; lower the rate",
+                code="sensor.rate.too_high",
             )
 
     def _line_speed(self, settings: LKSettings) -> int:

@@ -74,14 +74,16 @@ def reason(raw: int, highest: int) -> str:
 def encode_value(raw: int, *, first: bool = True) -> bytes:
     """Return the three bytes of an 18-bit value; ``first``: it is the first one of its sample."""
     if not 0 <= raw < 1 << COUNTER_BITS:
-        raise ProtocolError(f"A value has 18 bits; found {raw}")
+        raise ProtocolError(f"A value has 18 bits; found {raw}", code="sensor.value.outside")
     return bytes((raw & 0x3F, 0x40 | raw >> 6 & 0x3F, (0x80 if first else 0xC0) | raw >> 12))
 
 
 def decode_value(triple: bytes) -> int:
     """Return the 18-bit value of three bytes; ProtocolError if their tags are wrong."""
     if len(triple) != BYTES_PER_VALUE or not _VALUE.fullmatch(triple):
-        raise ProtocolError(f"Expected three bytes tagged 00, 01, 1x; found {triple.hex(' ')}")
+        raise ProtocolError(
+            f"Expected three bytes tagged 00, 01, 1x; found {triple.hex(' ')}", code="protocol.value.form"
+        )
     low, middle, high = triple
     return low | (middle & 0x3F) << 6 | (high & 0x3F) << 12
 
@@ -110,5 +112,6 @@ def check_line(rate: float, baudrate: int, *, counter: bool) -> None:
         raise InstrumentError(
             f"{rate / 1000:g} kHz exceeds {baudrate} baud: {rate:g} samples/s x {values} x 3 bytes "
             f"x 10 bits (8N1) = {needed:.0f} bit/s. Lower the rate, raise the baud rate"
-            + (", or set counter = false" if counter else "")
+            + (", or set counter = false" if counter else ""),
+            code="sensor.rate.too_high",
         )

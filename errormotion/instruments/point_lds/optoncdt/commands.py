@@ -35,6 +35,8 @@ _NO_VALUES = frozenset({"GETOUTINFO_RS422", "OK", "NONE"})
 class RefusedCommandError(InstrumentError):
     """The sensor has answered a command with an error."""
 
+    code = "instrument.refused"
+
 
 def parse_answer(command: str, text: bytes) -> list[str]:
     """Return the lines of an answer, without the repeated command and the prompt.
@@ -47,10 +49,15 @@ def parse_answer(command: str, text: bytes) -> list[str]:
         The answer is longer than any answer that the manuals describe.
     """
     if len(text) > MAX_ANSWER:
-        raise ProtocolError(f"The answer to '{command}' has {len(text)} bytes; expected {MAX_ANSWER} at most")
+        raise ProtocolError(
+            f"The answer to '{command}' has {len(text)} bytes; expected {MAX_ANSWER} at most",
+            code="protocol.reply.too_long",
+        )
     words = text.translate(None, _UNPRINTABLE).decode("ascii").replace(PROMPT.decode(), "\n")
     if words.count("\n") + words.count("\r") > 2 * MAX_LINES:
-        raise ProtocolError(f"The answer to '{command}' has more than {MAX_LINES} lines")
+        raise ProtocolError(
+            f"The answer to '{command}' has more than {MAX_LINES} lines", code="protocol.reply.too_long"
+        )
     lines = [_without_echo(command, line.strip()) for line in words.splitlines()]
     for line in lines:
         found = _ERROR.search(line.partition(":")[0])
@@ -98,7 +105,10 @@ def reported_range(facts: Mapping[str, str]) -> float | None:
         return None
     found = _RANGE.fullmatch(stated)
     if not found or not 0 < float(found[1]) < 1e5:
-        raise ProtocolError(f"Expected a measuring range such as '20.00mm' from GETINFO; found '{stated[:40]}'")
+        raise ProtocolError(
+            f"Expected a measuring range such as '20.00mm' from GETINFO; found '{stated[:40]}'",
+            code="protocol.reply.range",
+        )
     return float(found[1]) * 1e-3
 
 
@@ -139,6 +149,7 @@ def parse_layout(lines: Sequence[str], *, counter: bool) -> Layout:
     if set(values) != wanted or len(values) != len(wanted):
         raise InstrumentError(
             f"Expected the sensor to send {' and '.join(sorted(wanted, reverse=True))}; GETOUTINFO_RS422 lists "
-            f"'{' '.join(lines)[:200]}'. Switch the other values off on its web page, or restore its presets"
+            f"'{' '.join(lines)[:200]}'. Switch the other values off on its web page, or restore its presets",
+            code="sensor.output.form",
         )
     return Layout(values)

@@ -80,7 +80,8 @@ class StreamDecoder:
         if size - raws.size > MAX_GAP_SAMPLES:
             raise ProtocolError(
                 f"The sample counter jumps by {size - raws.size}, more than half of its {COUNTER_BITS} bits: "
-                "the sensor was restarted, or the data are not samples; start the stream again"
+                "the sensor was restarted, or the data are not samples; start the stream again",
+                code="protocol.counter.jump",
             )
         distances, reasons = np.empty(size), np.empty(size, dtype=np.uint8)
         kernels.convert(raws, numbers, self._next, self._range, self._highest, distances, reasons)

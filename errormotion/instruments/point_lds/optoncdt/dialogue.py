@@ -72,7 +72,9 @@ class Dialogue:
             No answer. The next command resynchronises first: a late answer is not mistaken for another one.
         """
         if self.lost is not None:
-            raise InstrumentError(f"The connection is lost ({self.lost}); close and open it again")
+            raise InstrumentError(
+                f"The connection is lost ({self.lost}); close and open it again", code="connection.lost"
+            )
         try:
             if self.reader is not None:
                 return parse_answer(text, self._answer_in_stream(self.reader, text))
@@ -181,5 +183,6 @@ class Dialogue:
 
 def _no_marker() -> ProtocolError:
     return ProtocolError(
-        f"No answer to {MARKER} among the late answers of the sensor; close and open the connection again"
+        f"No answer to {MARKER} among the late answers of the sensor; close and open the connection again",
+        code="protocol.reply.stale",
     )

@@ -106,7 +106,8 @@ class OptoNCDT(Driver):
         if known is None:
             raise InstrumentError(
                 f"The range of the {self.info.id} at {self.address} is unknown before it is opened: "
-                "open it first, or state 'range' in its settings"
+                "open it first, or state 'range' in its settings",
+                code="sensor.range.unknown",
             )
         return known
 
@@ -195,7 +196,7 @@ class OptoNCDT(Driver):
         """Return the present distance, m; NaN if the sensor has none."""
         for samples in self.stream(block=1):
             return float(samples.values[0, 0])
-        raise InstrumentError(f"{self.name}: the stream ended before its first sample")
+        raise InstrumentError(f"{self.name}: the stream ended before its first sample", code="stream.ended")
 
     def stream(self, block: int | None = None) -> Iterator[Samples]:
         """Yield blocks of samples until the caller stops, which stops the sensor.
@@ -248,7 +249,8 @@ class OptoNCDT(Driver):
         elif sync != "NONE":
             raise InstrumentError(
                 f"{self.name}: the {model.name} cannot be synchronised with other sensors; use sensors ILD2300, "
-                "or read them one by one"
+                "or read them one by one",
+                code="sensor.not_synchronisable",
             )
         self.command("RESETCNT MEASCNT")
         decoder = StreamDecoder(
@@ -274,7 +276,7 @@ class OptoNCDT(Driver):
     def fill(self, values: Array, reasons: Array) -> None:
         """Fill both arrays with the next samples: distances in m, and positions in `codec.REASONS`."""
         if self._reader is None:
-            raise InstrumentError(f"{self.name}: no stream is running; call start() first")
+            raise InstrumentError(f"{self.name}: no stream is running; call start() first", code="stream.not_running")
         self._reader.fill(values, reasons, self.settings.timeout)
 
     @property
@@ -344,7 +346,7 @@ class OptoNCDT(Driver):
 
     def _refuse_while_streaming(self) -> None:
         if self._reader is not None:
-            raise InstrumentError(f"{self.name} is streaming; close the stream first")
+            raise InstrumentError(f"{self.name} is streaming; close the stream first", code="stream.running")
 
     def _check_sensor(self, settings: OptoSettings) -> float:
         """Compare model and range with the settings; return the measuring range, m."""
@@ -352,16 +354,19 @@ class OptoNCDT(Driver):
         name, measured = facts.get("name", "unknown"), reported_range(facts)
         if not name.replace(" ", "").upper().startswith(settings.model):
             raise InstrumentError(
-                f"The settings state model {settings.model}; the sensor at {self.address} is a '{name}'"
+                f"The settings state model {settings.model}; the sensor at {self.address} is a '{name}'",
+                code="sensor.model.differs",
             )
         stated = settings.range
         if measured is None and stated is None:
             raise InstrumentError(
-                f"The sensor at {self.address} reports no measuring range; state 'range' in its settings"
+                f"The sensor at {self.address} reports no measuring range; state 'range' in its settings",
+                code="sensor.range.unknown",
             )
         if measured is not None and stated is not None and not np.isclose(measured, stated):
             raise InstrumentError(
                 f"The settings state a range of {stated * 1e3:g} mm; the sensor at {self.address} "
-                f"has {measured * 1e3:g} mm"
+                f"has {measured * 1e3:g} mm",
+                code="sensor.range.differs",
             )
         return float(stated if measured is None else measured)  # type: ignore[arg-type]

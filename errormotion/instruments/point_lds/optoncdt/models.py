@@ -52,7 +52,9 @@ class Model:
             if math.isclose(rate, known, rel_tol=1e-6):
                 return word
         known_rates = ", ".join(f"{known / 1000:g}" for known in self.rates)
-        raise InstrumentError(f"the {self.name} measures at {known_rates} kHz; found {rate / 1000:g} kHz")
+        raise InstrumentError(
+            f"the {self.name} measures at {known_rates} kHz; found {rate / 1000:g} kHz", code="sensor.rate.unknown"
+        )
 
 
 MODELS: Mapping[str, Model] = {

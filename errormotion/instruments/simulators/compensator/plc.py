@@ -104,5 +104,7 @@ def _settings(address: Address) -> dict[str, object]:
     try:
         RegisterSettings.model_validate(given)
     except ValidationError as error:
-        raise InstrumentError(f"The registers in '{address.url}' are invalid: {error.errors()[0]['msg']}") from None
+        raise InstrumentError(
+            f"The registers in '{address.url}' are invalid: {error.errors()[0]['msg']}", code="simulator.setting"
+        ) from None
     return given

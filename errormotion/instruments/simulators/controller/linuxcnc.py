@@ -174,7 +174,8 @@ def _end_unused() -> None:
         if control.users and control.process.running:
             raise InstrumentError(
                 f"A computer can only run one LinuxCNC; it runs for {key[0]} with seed {key[1]}: "
-                "close that driver first, or use the same seed and parameters in both addresses"
+                "close that driver first, or use the same seed and parameters in both addresses",
+                code="simulator.linuxcnc.used",
             )
         control.process.end()
         del _controls[key]
@@ -327,7 +328,7 @@ class SimulatedLinuxCNC(SimulatedDevice):
             if "beat" not in message:
                 break
         if not message["ok"]:
-            raise InstrumentError(f"The simulated LinuxCNC refuses '{op}': {message['error']}")
+            raise InstrumentError(f"The simulated LinuxCNC refuses '{op}': {message['error']}", code="linuxcnc.refused")
         return message["result"]
 
     def _carry_back(self) -> None:

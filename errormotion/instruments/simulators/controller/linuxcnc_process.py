@@ -55,7 +55,10 @@ def installed() -> str:
         [PYTHON, "-c", "import hal, linuxcnc; print(linuxcnc.version)"], capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise InstrumentError(f"LinuxCNC's module for {PYTHON} does not load: {done.stderr.strip()[-300:]}")
+        raise InstrumentError(
+            f"LinuxCNC's module for {PYTHON} does not load: {done.stderr.strip()[-300:]}",
+            code="simulator.linuxcnc.not_loaded",
+        )
     return f"LinuxCNC {done.stdout.strip()}"
 
 
@@ -64,7 +67,7 @@ def for_doctor() -> str:
     if shutil.which("linuxcnc") is None:
         return f"not installed; needed for sim://.../linuxcnc only: {why_not()}"
     if reason := why_not():
-        raise InstrumentError(reason)
+        raise InstrumentError(reason, code="simulator.linuxcnc.missing")
     return f"{installed()}, for sim://.../linuxcnc"
 
 
@@ -98,7 +101,7 @@ class LinuxCNCProcess:
 
     def __init__(self, files: dict[str, str], bridge: Path, *, wait: float = 60.0) -> None:
         if reason := why_not():
-            raise InstrumentError(reason)
+            raise InstrumentError(reason, code="simulator.linuxcnc.missing")
         lock = _lock(wait)
         try:
             _refuse_beside_another()
@@ -180,7 +183,9 @@ class LinuxCNCProcess:
             if not self.running or time.monotonic() > until:
                 why = "ended at once" if not self.running else f"did not start within {START_TIMEOUT:g} s"
                 log = (self.folder / "log.txt").read_text(errors="replace")
-                raise InstrumentError(f"LinuxCNC {why}; end of its log:\n{log[-2000:]}")
+                raise InstrumentError(
+                    f"LinuxCNC {why}; end of its log:\n{log[-2000:]}", code="simulator.linuxcnc.not_started"
+                )
             time.sleep(0.02)
         announced = json.loads(file.read_text())
         return Path(announced["socket"]), int(announced["pid"])
@@ -270,7 +275,8 @@ def _lock(wait: float) -> int:
             os.close(file)
             raise InstrumentError(
                 "A computer can only run one LinuxCNC; another simulated one did not end in time, "
-                f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address"
+                f"in {wait:g} s. Close it, or wait longer with 'wait=' in the address",
+                code="simulator.linuxcnc.used",
             ) from None
 
 
@@ -279,7 +285,9 @@ def _refuse_beside_another() -> None:
     found = {name: pid for pid, (name, state) in _processes().items() if name in PROCESSES and state != "Z"}
     if found:
         named = ", ".join(f"{name} ({pid})" for name, pid in sorted(found.items()))
-        raise InstrumentError(f"A LinuxCNC that is not simulated runs on this computer: {named}")
+        raise InstrumentError(
+            f"A LinuxCNC that is not simulated runs on this computer: {named}", code="simulator.linuxcnc.used"
+        )
     with suppress(OSError):
         LINUXCNC_LOCK.unlink()  # left by a killed LinuxCNC
 

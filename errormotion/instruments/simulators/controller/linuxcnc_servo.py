@@ -77,5 +77,7 @@ class ServoThreadPart:
             ["halcmd", "-s", "-f"], input="\n".join(lines), capture_output=True, text=True, timeout=TIMEOUT, check=False
         )
         if done.returncode:
-            raise InstrumentError(f"halcmd {lines[0]!r} failed: {done.stderr.strip()[:300]}")
+            raise InstrumentError(
+                f"halcmd {lines[0]!r} failed: {done.stderr.strip()[:300]}", code="simulator.linuxcnc.command"
+            )
         return done.stdout

@@ -88,7 +88,9 @@ class SimulatedAdapter:
         name, times = address.params.get("style", "okuma"), address.params.get("times", "absolute")
         if name not in STYLES or times not in ("absolute", "none"):
             known = f"'style' one of {', '.join(STYLES)}, 'times' absolute or none"
-            raise InstrumentError(f"'{address.url}': expected {known}; found '{name}', '{times}'")
+            raise InstrumentError(
+                f"'{address.url}': expected {known}; found '{name}', '{times}'", code="simulator.setting"
+            )
         style = STYLES[name]
         self._offset = work_offset(address, style.offset)
         self._timed = times == "absolute"
@@ -214,7 +216,9 @@ class SimulatedAdapter:
 def _choice(address: Address, name: str, known: tuple[str, ...]) -> str:
     value = address.params.get(name, known[0])
     if value not in known:
-        raise InstrumentError(f"'{name}={value}' in '{address.url}': expected one of {', '.join(known)}")
+        raise InstrumentError(
+            f"'{name}={value}' in '{address.url}': expected one of {', '.join(known)}", code="simulator.setting"
+        )
     return value
 
 

@@ -107,7 +107,9 @@ class SimulatedIds(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of an interferometer: {error}") from None
+            raise InstrumentError(
+                f"'{address.url}' has invalid parameters of an interferometer: {error}", code="simulator.setting"
+            ) from None
 
     def _set_up(self, address: Address) -> None:
         self._noise, self._init = address.number("noise", 2e-10), address.number("init", 0.02)
@@ -116,7 +118,7 @@ class SimulatedIds(SimulatedDevice):
         self._old, self._code = address.number("api", 2) < 2, int(address.number("code", BAD_VALUE))
         self._families = tuple(address.params.get("functions", ",".join(FAMILIES)).split(","))
         if not set(self._families) <= set(FAMILIES):
-            raise InstrumentError(f"'functions': expected some of {', '.join(FAMILIES)}")
+            raise InstrumentError(f"'functions': expected some of {', '.join(FAMILIES)}", code="simulator.setting")
         self._breaks = {int(each) - 1 for each in numbers(address, "broken", "1,2,3")}
         self._beams = [self._beam(address, axis) for axis in range(AXES)]
         self._distances = [address.number(f"distance{axis + 1}", 0.5) for axis in range(AXES)]
@@ -132,7 +134,7 @@ class SimulatedIds(SimulatedDevice):
         default = ",".join("1" if axis == each else "0" for each in range(AXES))
         direction = np.array(numbers(address, f"beam{axis + 1}", default))
         if direction.shape != (3,) or not np.linalg.norm(direction) > 0.0:
-            raise InstrumentError(f"'beam{axis + 1}': expected a direction of three numbers")
+            raise InstrumentError(f"'beam{axis + 1}': expected a direction of three numbers", code="simulator.setting")
         lever = address.params.get(f"lever{axis + 1}", address.params.get("lever", "0,0,0"))
         rng = np.random.default_rng(abs(int(address.number("seed", 0))))  # the same for all axes: there is one machine
         scene = TrackerScene(self.world, replace(address, params={**address.params, "lever": lever}), rng)

@@ -55,7 +55,9 @@ class GantryProfiles:
         from errormotion.twin.sensors.profiler import Profiler
 
         if world.name != "gantry":
-            raise InstrumentError(f"'artefact=twin' in '{address.url}': only sim://gantry has a crossbeam")
+            raise InstrumentError(
+                f"'artefact=twin' in '{address.url}': only sim://gantry has a crossbeam", code="simulator.setting"
+            )
         self.channel = name
         self._world = world
         self._disturbances = _disturbances(address)
@@ -65,7 +67,8 @@ class GantryProfiles:
         if not self._pitch > 0 or self._step < 1:
             raise InstrumentError(
                 f"'encoder_pitch' and 'encoder_step' in '{address.url}': expected a length in m above 0 and an integer "
-                f"of at least 1; found {self._pitch:g} and {self._step}"
+                f"of at least 1; found {self._pitch:g} and {self._step}",
+                code="simulator.setting",
             )
         self._table = _table(address, world)
         self._began = 0.0
@@ -190,7 +193,10 @@ def _disturbances(address: Address) -> Any:
 
     name = address.params.get("disturbances", "full")
     if name not in DISTURBANCES:
-        raise InstrumentError(f"'disturbances={name}' in '{address.url}': expected one of {', '.join(DISTURBANCES)}")
+        raise InstrumentError(
+            f"'disturbances={name}' in '{address.url}': expected one of {', '.join(DISTURBANCES)}",
+            code="simulator.setting",
+        )
     return {"none": Disturbances.none, "white": Disturbances.white, "full": Disturbances}[name]()
 
 
@@ -203,14 +209,17 @@ def _table(address: Address, world: VirtualWorld) -> Any:
         given = [] if text is None or text == "none" else [float(y) for y in text.split(",")]
     except ValueError:
         raise InstrumentError(
-            f"'artefacts={text}' in '{address.url}': expected positions in m, separated by commas"
+            f"'artefacts={text}' in '{address.url}': expected positions in m, separated by commas",
+            code="simulator.setting",
         ) from None
     positions = default_positions(crossbeam.travel) if text is None else given
     pocket = address.number("pocket", 0.0) if "pocket" in address.params else None
     low, high = crossbeam.travel
     if outside := [y for y in [*positions, *([] if pocket is None else [pocket])] if not low <= y <= high]:
-        raise InstrumentError(f"Y travels from {low:g} to {high:g} m; found {outside[0]:g} m in '{address.url}'")
+        raise InstrumentError(
+            f"Y travels from {low:g} to {high:g} m; found {outside[0]:g} m in '{address.url}'", code="simulator.setting"
+        )
     try:
         return set_table(crossbeam, world.seed, positions, pocket)
     except BenchError as error:
-        raise InstrumentError(f"'{address.url}': {error}") from None
+        raise InstrumentError(f"'{address.url}': {error}", code="simulator.setting") from None

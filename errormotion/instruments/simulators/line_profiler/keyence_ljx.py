@@ -56,7 +56,9 @@ class SimulatedLJX(SimulatedDevice):
 
     def __init__(self, address: Address, source: ProfileSource | None = None) -> None:
         if address.params.get("wire", "tcp") != "tcp":
-            raise InstrumentError(f"A line profiler has network connections only; found '{address.url}'")
+            raise InstrumentError(
+                f"A line profiler has network connections only; found '{address.url}'", code="simulator.setting"
+            )
         artefact = address.params.get("artefact", "twin" if address.host == "gantry" else "swept")
         if source is None and artefact != "twin":
             source = make_source(artefact, int(address.number("seed", 0)))
@@ -187,7 +189,8 @@ def _trigger_mode(address: Address) -> int:
     name = address.params.get("trigger", "external")
     if name not in settings.TRIGGER_MODES:
         raise InstrumentError(
-            f"'trigger={name}' in '{address.url}': expected one of {', '.join(settings.TRIGGER_MODES)}"
+            f"'trigger={name}' in '{address.url}': expected one of {', '.join(settings.TRIGGER_MODES)}",
+            code="simulator.setting",
         )
     return settings.TRIGGER_MODES.index(name)
 

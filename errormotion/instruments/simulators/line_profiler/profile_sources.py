@@ -214,5 +214,7 @@ SOURCES: dict[str, Callable[[int], ProfileSource]] = {"swept": SweptSurface}
 def make_source(name: str, seed: int, sources: Mapping[str, Callable[[int], ProfileSource]] = SOURCES) -> ProfileSource:
     """Return a surface by its name; InstrumentError lists the known names."""
     if name not in sources:
-        raise InstrumentError(f"'artefact={name}': expected one of {', '.join(sorted({*sources, 'twin'}))}")
+        raise InstrumentError(
+            f"'artefact={name}': expected one of {', '.join(sorted({*sources, 'twin'}))}", code="simulator.setting"
+        )
     return sources[name](seed)

@@ -38,7 +38,9 @@ class DataPortDevice(SimulatedDevice):
             self._data = TcpServer(f"{self.name}-data", _ignore, on_connection)
         except (InstrumentError, ValueError) as error:
             SimulatedDevice.close(self)
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
+            raise InstrumentError(
+                f"'{address.url}' has invalid parameters of a controller: {error}", code="simulator.setting"
+            ) from None
         self._data.start()
         self.urls = {"data": self._data.url}
         self.port = int(self._data.url.rsplit(":", 1)[1])

@@ -57,7 +57,9 @@ class SimulatedKeyenceLK(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, KeyError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a controller: {error}") from None
+            raise InstrumentError(
+                f"'{address.url}' has invalid parameters of a controller: {error}", code="simulator.setting"
+            ) from None
 
     def _set_up(self, address: Address) -> None:
         controller = grammar.CONTROLLERS[address.params.get("controller", "LK-G5000")]

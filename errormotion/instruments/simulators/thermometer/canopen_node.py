@@ -296,13 +296,18 @@ def _code(address: Address, key: str, default: int) -> int:
     try:
         return int(text, 16)
     except ValueError:
-        raise InstrumentError(f"'{key}' in '{address.url}': expected a hexadecimal number; found '{text}'") from None
+        raise InstrumentError(
+            f"'{key}' in '{address.url}': expected a hexadecimal number; found '{text}'", code="simulator.setting"
+        ) from None
 
 
 def _choices(address: Address, key: str, default: str, known: tuple[str, ...]) -> list[str]:
     found = address.params.get(key, default).split(",")
     if unknown := [each for each in found if each not in known]:
-        raise InstrumentError(f"'{key}' in '{address.url}': expected {', '.join(known)}; found {', '.join(unknown)}")
+        raise InstrumentError(
+            f"'{key}' in '{address.url}': expected {', '.join(known)}; found {', '.join(unknown)}",
+            code="simulator.setting",
+        )
     return found
 
 
@@ -311,7 +316,9 @@ def _bus(address: Address) -> dict[str, Any] | None:
     if kind == "virtual":
         return None
     if kind != "udp_multicast":
-        raise InstrumentError(f"'bus' in '{address.url}': expected 'virtual' or 'udp_multicast'; found '{kind}'")
+        raise InstrumentError(
+            f"'bus' in '{address.url}': expected 'virtual' or 'udp_multicast'; found '{kind}'", code="simulator.setting"
+        )
     return {
         "interface": kind,
         "channel": address.params.get("group", "239.74.163.2"),

@@ -51,14 +51,19 @@ class SimulatedDcon(SimulatedDevice):
         if model not in SPANS or form not in FORMATS or (model == "4018" and form != FORMATS[0]):
             raise InstrumentError(
                 f"'{address.url}': expected 'model' 7018 or 4018 and 'format' {', '.join(FORMATS)} (4018: the first); "
-                f"found '{model}' and '{form}'"
+                f"found '{model}' and '{form}'",
+                code="simulator.setting",
             )
         type_code = address.whole("type", TYPE_T, 255)
         if type_code not in SPANS[model]:
-            raise InstrumentError(f"'type' in '{address.url}': expected an input range of a {model}; found {type_code}")
+            raise InstrumentError(
+                f"'type' in '{address.url}': expected an input range of a {model}; found {type_code}",
+                code="simulator.setting",
+            )
         if len(self._inputs.names) > CHANNELS:
             raise InstrumentError(
-                f"'sensors' in '{address.url}': expected at most {CHANNELS} sensors; found {len(self._inputs.names)}"
+                f"'sensors' in '{address.url}': expected at most {CHANNELS} sensors; found {len(self._inputs.names)}",
+                code="simulator.setting",
             )
         return Module(
             self._temperatures,

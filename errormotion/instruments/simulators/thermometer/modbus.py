@@ -106,4 +106,6 @@ def _settings(address: Address, names: tuple[str, ...]) -> ModbusSettings:
     try:
         return ModbusSettings.model_validate({**given, "channels": names})
     except ValidationError as error:
-        raise InstrumentError(f"The register map in '{address.url}' is invalid: {error.errors()[0]['msg']}") from None
+        raise InstrumentError(
+            f"The register map in '{address.url}' is invalid: {error.errors()[0]['msg']}", code="simulator.setting"
+        ) from None

@@ -35,7 +35,10 @@ class Inputs:
         known = machine.temperature_sensors
         self.names = tuple(address.params.get("sensors", DEFAULT_SENSORS).split(","))
         if unknown := [name for name in self.names if name not in known]:
-            raise InstrumentError(f"Expected sensors of the machine, {', '.join(known)}; found {', '.join(unknown)}")
+            raise InstrumentError(
+                f"Expected sensors of the machine, {', '.join(known)}; found {', '.join(unknown)}",
+                code="simulator.setting",
+            )
         self.open, self.shorted = (_numbers(address, key, len(self.names)) for key in ("open", "shorted"))
         self._machine, self._noise = machine, address.number("noise", NOISE)
         self._indices = [known.index(name) for name in self.names]
@@ -53,7 +56,9 @@ def _numbers(address: Address, key: str, n: int) -> frozenset[int]:
     except ValueError:
         found = frozenset((-1,))
     if not found <= frozenset(range(n)):
-        raise InstrumentError(f"'{key}' in '{address.url}': expected inputs from 0 to {n - 1}; found '{text}'")
+        raise InstrumentError(
+            f"'{key}' in '{address.url}': expected inputs from 0 to {n - 1}; found '{text}'", code="simulator.setting"
+        )
     return found
 
 

@@ -124,5 +124,7 @@ def _choice(address: Address, key: str, choices: tuple[str, ...]) -> str:
     """Return a parameter; by default the first choice."""
     found = address.params.get(key, choices[0])
     if found not in choices:
-        raise InstrumentError(f"'{key}' in '{address.url}': expected {', '.join(choices)}; found '{found}'")
+        raise InstrumentError(
+            f"'{key}' in '{address.url}': expected {', '.join(choices)}; found '{found}'", code="simulator.setting"
+        )
     return found

@@ -102,7 +102,10 @@ class SampleClock:
     def _refuse_while_streaming(self, what: str) -> None:
         names = [each.channel for each in self._streams] + [each.channel for each in self._triggered]
         if names:
-            raise InstrumentError(f"Cannot {what} while {', '.join(names)} stream; stop the streams first")
+            raise InstrumentError(
+                f"Cannot {what} while {', '.join(names)} stream; stop the streams first",
+                code="simulator.streams.running",
+            )
 
     def _forget_streams(self) -> threading.Thread | None:
         """Remove all streams, so that the thread ends; return the thread for joining."""

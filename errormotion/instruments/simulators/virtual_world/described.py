@@ -29,11 +29,13 @@ def described(name: str) -> str | MachineDescription:
         return name
     if _described is None:
         raise InstrumentError(
-            f"'sim://{NAME}' is the machine of the bench: expected a table [machine] in the bench file; found none"
+            f"'sim://{NAME}' is the machine of the bench: expected a table [machine] in the bench file; found none",
+            code="simulator.machine.missing",
         )
     if _described.moving_axes != ("X", "Y", "Z"):
         raise InstrumentError(
             f"'sim://{NAME}': the simulated control moves X, Y and Z; found {', '.join(_described.moving_axes)}. "
-            "Fix the rotary axes in [machine]"
+            "Fix the rotary axes in [machine]",
+            code="simulator.machine.axes",
         )
     return _described

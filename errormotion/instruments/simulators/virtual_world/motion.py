@@ -77,7 +77,9 @@ class Motion(SampleClock):
     def mount(self, tool: str) -> None:
         """Mount the bar, the sphere or the touch probe in the spindle."""
         if tool not in TOOLS:
-            raise InstrumentError(f"Expected the tool 'bar', 'sphere' or 'probe'; found '{tool}'")
+            raise InstrumentError(
+                f"Expected the tool 'bar', 'sphere' or 'probe'; found '{tool}'", code="simulator.tool.unknown"
+            )
         with self._change:
             self._refuse_while_streaming("change the tool")
             self._refuse_in_alarm()
@@ -89,7 +91,7 @@ class Motion(SampleClock):
         """Step the sphere along a line; the motion starts after a short and unknown time."""
         with self._change:
             if self.tool != "sphere":
-                raise InstrumentError("Only the sphere can be stepped; mount it first")
+                raise InstrumentError("Only the sphere can be stepped; mount it first", code="simulator.tool.no_sphere")
             self._refuse_to_move()
             begin = self._start_of_motion()
             self.motion = StepProgram(tuple(start), tuple(direction), step, count, dwell, travel, begin=begin)
@@ -160,11 +162,17 @@ class Motion(SampleClock):
             goal, feed = self._within_travel(target), self._possible_feed(feed)
             begin, start = self.time, np.array(self.position())
             if speed := self.commanded_speed(begin):
-                raise InstrumentError(f"The spindle turns at {speed:g} /min; stop it before the machine probes")
+                raise InstrumentError(
+                    f"The spindle turns at {speed:g} /min; stop it before the machine probes",
+                    code="machine.spindle.turning",
+                )
             if self.stuck == "closed" or not (
                 self.stuck == "open" or self.machine.released(start, begin, balls=self.balls)
             ):
-                raise InstrumentError("The probe is tripped before it moves; remove the contact or repair the probe")
+                raise InstrumentError(
+                    "The probe is tripped before it moves; remove the contact or repair the probe",
+                    code="probe.tripped.before",
+                )
             self.tool = "probe"
             contact = self.trip(start, goal, begin, feed, released=True)
             self._go(start, goal if contact is None else contact, begin, feed)
@@ -220,10 +228,13 @@ class Motion(SampleClock):
 
     def _refuse_in_alarm(self) -> None:
         if self.estop:
-            raise InstrumentError("The machine is in emergency stop; release it and reset the machine")
+            raise InstrumentError(
+                "The machine is in emergency stop; release it and reset the machine", code="machine.emergency_stop"
+            )
         if self.alarms:
             raise InstrumentError(
-                f"The machine is in alarm: {'; '.join(self.alarms)}. Remove the cause and reset the machine"
+                f"The machine is in alarm: {'; '.join(self.alarms)}. Remove the cause and reset the machine",
+                code="machine.alarm",
             )
 
     def _refuse_to_move(self) -> None:
@@ -233,21 +244,28 @@ class Motion(SampleClock):
     def _refuse_while_moving(self) -> None:
         if self.stepping or self.running:
             what = "stepping" if self.stepping else "running"
-            raise InstrumentError(f"The machine is still {what}; wait until its program has ended")
+            raise InstrumentError(
+                f"The machine is still {what}; wait until its program has ended", code="machine.moving"
+            )
 
     def _within_travel(self, position: Sequence[float]) -> Array:
         goal = np.array(position, dtype=float)
         if goal.shape != (3,) or not np.isfinite(goal).all():
-            raise InstrumentError(f"Expected a position X, Y, Z in m; found {position!r}")
+            raise InstrumentError(f"Expected a position X, Y, Z in m; found {position!r}", code="position.form")
         for (axis, (low, high)), x in zip(self.machine.travel.items(), goal, strict=True):
             if not low - _ROUNDING <= x <= high + _ROUNDING:
-                raise InstrumentError(f"{axis} travels from {low:g} to {high:g} m; found {x:g}")
+                raise InstrumentError(
+                    f"{axis} travels from {low:g} to {high:g} m; found {x:g}", code="machine.position.outside"
+                )
         return goal
 
     def _possible_feed(self, feed: float | None) -> float:
         chosen = self.machine.rapid if feed is None else float(feed)
         if not 0 < chosen <= self.machine.rapid * (1 + 1e-9):
-            raise InstrumentError(f"Expected a feed above 0 and at most {self.machine.rapid:g} m/s; found {chosen:g}")
+            raise InstrumentError(
+                f"Expected a feed above 0 and at most {self.machine.rapid:g} m/s; found {chosen:g}",
+                code="machine.feed.outside",
+            )
         return chosen
 
     def commanded_speed(self, time: float) -> float:
@@ -339,12 +357,12 @@ class ProgramActions:
     def pass_by(self, start: Array, goal: Array, feed: float, time: float) -> None:
         """Refuse a move on which the probe would collide with a ball."""
         if self._world.obstacle(start, goal, self._begin + time, feed) is not None:
-            raise InstrumentError("the probe would trip on this path")
+            raise InstrumentError("the probe would trip on this path", code="probe.path.not_free")
 
     def skip(self, start: Array, goal: Array, feed: float, time: float) -> Array:
         """Return where the probe stops a move."""
         if speed := self._world.commanded_speed(self._begin + time):
-            raise InstrumentError(f"the spindle turns at {speed:g} /min; M5 first")
+            raise InstrumentError(f"the spindle turns at {speed:g} /min; M5 first", code="machine.spindle.turning")
         self._world.tool = "probe"
         contact = self._world.trip(start, goal, self._begin + time, feed)
         return goal if contact is None else contact

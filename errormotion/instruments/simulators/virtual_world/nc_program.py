@@ -97,10 +97,12 @@ def interpret(
             else:
                 control.execute(_words(number, line))
         except ErrormotionError as error:
-            raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}") from None
+            raise InstrumentError(f"Line {number} '{line.strip()[:60]}': {error}", code=error.code) from None
         if control.ended:
             return control.path()
-    raise InstrumentError("The program ends without M30 or M2; check that it is complete")
+    raise InstrumentError(
+        "The program ends without M30 or M2; check that it is complete", code="machine.program.no_end"
+    )
 
 
 def title(text: str) -> str:
@@ -116,9 +118,13 @@ def _words(number: int, line: str) -> list[tuple[str, float]]:
     try:
         block = split(number, line)
     except BlockError as error:
-        raise InstrumentError(f"{error.why}; supported are {UNDERSTOOD}") from None
+        raise InstrumentError(
+            f"{error.why}; supported are {UNDERSTOOD}", code="machine.program.not_supported"
+        ) from None
     if block.skippable:
-        raise InstrumentError(f"'/' is not a word of a program; supported are {UNDERSTOOD}")
+        raise InstrumentError(
+            f"'/' is not a word of a program; supported are {UNDERSTOOD}", code="machine.program.not_supported"
+        )
     return [(letter, float(value)) for letter, value, _ in block.words]
 
 
@@ -154,16 +160,18 @@ class _Control:
         numbers = [(letter, value) for letter, value in words if letter not in "GMN"]
         values = dict(numbers)
         if len(values) < len(numbers):
-            raise InstrumentError("the same letter twice in one line")
+            raise InstrumentError("the same letter twice in one line", code="machine.program.repeated")
         for code in codes:
             self._set(code, codes)
         if unknown := set(values) - set("XYZFPS"):
-            raise InstrumentError(f"'{min(unknown)}' is not supported; supported are {UNDERSTOOD}")
+            raise InstrumentError(
+                f"'{min(unknown)}' is not supported; supported are {UNDERSTOOD}", code="machine.program.not_supported"
+            )
         self._turn(codes, values.pop("S", None))
         if "G4" in codes:
             self._dwell(values)
         elif "P" in values:
-            raise InstrumentError("expected P (s) only with a dwell, G4")
+            raise InstrumentError("expected P (s) only with a dwell, G4", code="machine.program.dwell")
         else:
             self._advance(values, skipping="G31" in codes)
 
@@ -176,9 +184,13 @@ class _Control:
                 return float(round(printer.clock(self._times[-1]) * MILLI))  # in ms
             if variable not in _SKIPPED:
                 known = ", ".join(f"#{each}" for each in (*_SKIPPED, _CLOCK))
-                raise InstrumentError(f"#{variable} is not supported; supported are {known}")
+                raise InstrumentError(
+                    f"#{variable} is not supported; supported are {known}", code="machine.program.variable"
+                )
             if self._skipped is None:
-                raise InstrumentError("expected a skip move, G31, before its position is printed")
+                raise InstrumentError(
+                    "expected a skip move, G31, before its position is printed", code="machine.program.no_skip"
+                )
             return float(self._skipped[_SKIPPED[variable]]) * MM
 
         printer.print(parse_block(template, value), self._times[-1])
@@ -190,15 +202,17 @@ class _Control:
 
     def _require_peripherals(self, what: str) -> Peripherals:
         if self._peripherals is None:
-            raise InstrumentError(f"{what} is not available here")
+            raise InstrumentError(f"{what} is not available here", code="machine.program.variable")
         return self._peripherals
 
     def _turn(self, codes: list[str], speed: float | None) -> None:
         """Turn the spindle, stop it, or change its speed."""
         if "M3" in codes and "M5" in codes:
-            raise InstrumentError("M3 and M5 in one line")
+            raise InstrumentError("M3 and M5 in one line", code="machine.program.spindle")
         if "M3" in codes and speed is None:
-            raise InstrumentError("expected the spindle speed, 1/min, with M3, as in M3 S8000")
+            raise InstrumentError(
+                "expected the spindle speed, 1/min, with M3, as in M3 S8000", code="machine.program.spindle"
+            )
         if "M5" in codes:
             self._turning = False
             self._require_peripherals("a spindle").spindle(0.0, self._times[-1])
@@ -206,23 +220,29 @@ class _Control:
             self._turning = True
             self._require_peripherals("a spindle").spindle(float(speed or 0.0), self._times[-1])
         elif speed is not None:
-            raise InstrumentError("a speed S while the spindle does not turn; expected M3 with it")
+            raise InstrumentError(
+                "a speed S while the spindle does not turn; expected M3 with it", code="machine.program.spindle"
+            )
 
     def _set(self, code: str, codes: list[str]) -> None:
         if code in _REFUSED:
-            raise InstrumentError(_REFUSED[code])
+            raise InstrumentError(_REFUSED[code], code="machine.program.not_supported")
         if code in ("G0", "G1"):
             if "G0" in codes and "G1" in codes:
-                raise InstrumentError("G0 and G1 in one line")
+                raise InstrumentError("G0 and G1 in one line", code="machine.program.two_motions")
             self._move = code
         elif code in ("M2", "M30"):
             self.ended = True
         elif code not in (*_WITHOUT_EFFECT, "G4", "G31", "M3", "M5"):
-            raise InstrumentError(f"'{code}' is not supported; supported are {UNDERSTOOD}")
+            raise InstrumentError(
+                f"'{code}' is not supported; supported are {UNDERSTOOD}", code="machine.program.not_supported"
+            )
 
     def _dwell(self, values: Mapping[str, float]) -> None:
         if set(values) != {"P"} or values["P"] < 0:
-            raise InstrumentError("expected a dwell such as G4 P2.5, P in s, and no other words")
+            raise InstrumentError(
+                "expected a dwell such as G4 P2.5, P in s, and no other words", code="machine.program.dwell"
+            )
         self._append(values["P"], self._positions[-1], fast=False)
 
     def _advance(self, values: Mapping[str, float], *, skipping: bool) -> None:
@@ -231,7 +251,8 @@ class _Control:
             self._feed = values["F"] / MM / MINUTE
             if not 0 < self._feed <= self._rapid + _ROUNDING:
                 raise InstrumentError(
-                    f"expected a feed above 0 and at most {self._rapid * MM * MINUTE:g} mm/min; found {values['F']:g}"
+                    f"expected a feed above 0 and at most {self._rapid * MM * MINUTE:g} mm/min; found {values['F']:g}",
+                    code="machine.feed.outside",
                 )
         goal = self._positions[-1].copy()
         for number, axis in enumerate("XYZ"):
@@ -241,10 +262,10 @@ class _Control:
             return
         move = "G31" if skipping else self._move
         if not move:
-            raise InstrumentError("a position before G0 or G1")
+            raise InstrumentError("a position before G0 or G1", code="machine.program.no_motion")
         feed = self._rapid if move == "G0" else self._feed
         if feed is None:
-            raise InstrumentError(f"a move with {move} before a feed F")
+            raise InstrumentError(f"a move with {move} before a feed F", code="machine.program.no_feed")
         now = self._positions[-1], goal, feed, self._times[-1]
         if skipping:
             goal = self._skipped = self._require_peripherals("a probe").skip(*now)
@@ -255,7 +276,10 @@ class _Control:
     def _within(self, axis: str, value: float) -> float:
         low, high = self._travel[axis]
         if not low - _ROUNDING <= value / MM <= high + _ROUNDING:
-            raise InstrumentError(f"{axis} travels from {low * MM:g} to {high * MM:g} mm; found {value:g}")
+            raise InstrumentError(
+                f"{axis} travels from {low * MM:g} to {high * MM:g} mm; found {value:g}",
+                code="machine.position.outside",
+            )
         return value / MM
 
     def _append(self, seconds: float, position: Array, *, fast: bool) -> None:

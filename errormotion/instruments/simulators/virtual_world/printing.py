@@ -77,16 +77,24 @@ def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
             parts.append(text)
             k += len(text)
         elif template[k] == "#":
-            raise InstrumentError(f"'{template[k:][:12]}': expected a variable with its format, such as #5061[53]")
+            raise InstrumentError(
+                f"'{template[k:][:12]}': expected a variable with its format, such as #5061[53]",
+                code="machine.print.form",
+            )
         else:
-            raise InstrumentError(f"'{template[k]}' cannot be printed; expected letters, digits, + - / and *")
+            raise InstrumentError(
+                f"'{template[k]}' cannot be printed; expected letters, digits, + - / and *", code="machine.print.form"
+            )
     return Block(tuple(parts))
 
 
 def _number(found: re.Match[str], value_of: Callable[[str], float]) -> Number:
     whole, decimals = int(found[2]), int(found[3])
     if not 0 < whole + decimals <= MAX_DIGITS:
-        raise InstrumentError(f"'{found[0]}': expected 1 to {MAX_DIGITS} digits in all; found {whole + decimals}")
+        raise InstrumentError(
+            f"'{found[0]}': expected 1 to {MAX_DIGITS} digits in all; found {whole + decimals}",
+            code="machine.print.digits",
+        )
     return Number(value_of(found[1]), whole, decimals)
 
 

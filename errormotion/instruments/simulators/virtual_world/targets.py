@@ -51,10 +51,13 @@ class TargetStand:
         """
         plane = kind == "plane"
         if kind not in (None, "plane", "bar"):
-            raise InstrumentError(f"Expected the target 'plane', 'bar' or None; found {kind!r}")
+            raise InstrumentError(
+                f"Expected the target 'plane', 'bar' or None; found {kind!r}", code="simulator.target.unknown"
+            )
         if [angle is not None for angle in (inclination, rotation)] != [plane, plane]:
             raise InstrumentError(
-                f"Expected inclination and rotation (rad) only with a plane; found {kind!r}, {inclination}, {rotation}"
+                f"Expected inclination and rotation (rad) only with a plane; found {kind!r}, {inclination}, {rotation}",
+                code="simulator.target.angles",
             )
         if inclination is not None and rotation is not None:
             face = self._machine.sine_gauge.face(float(inclination), float(rotation), self.settings)

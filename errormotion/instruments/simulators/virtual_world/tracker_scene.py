@@ -47,7 +47,8 @@ def numbers(address: Address, name: str, default: str) -> tuple[float, ...]:
         return tuple(float(word) for word in text.split(","))
     except ValueError:
         raise InstrumentError(
-            f"'{name}' in '{address.url}': expected numbers separated by commas; found '{text}'"
+            f"'{name}' in '{address.url}': expected numbers separated by commas; found '{text}'",
+            code="simulator.setting",
         ) from None
 
 
@@ -71,7 +72,10 @@ class TrackerScene:
         self.station = np.array(numbers(address, "station", STATION))
         self.lever = np.array(numbers(address, "lever", "0,0,0"))
         if self.station.shape != (3,) or self.lever.shape != (3,):
-            raise InstrumentError(f"'station' and 'lever' in '{address.url}': expected three numbers each, x,y,z in m")
+            raise InstrumentError(
+                f"'station' and 'lever' in '{address.url}': expected three numbers each, x,y,z in m",
+                code="simulator.setting",
+            )
         heading = address.number("heading", 0.0)
         c, s = np.cos(heading), np.sin(heading)
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # from the tracker's frame to the machine's

@@ -125,7 +125,7 @@ class VirtualWorld(Motion):
         command to the spindle turns it, and does not change the heat.
         """
         if not 0 <= time < np.inf:
-            raise InstrumentError(f"Expected a time of at least 0 s; found {time} s")
+            raise InstrumentError(f"Expected a time of at least 0 s; found {time} s", code="simulator.time.negative")
         with self._change:
             self._refuse_while_streaming("set the clock")
             self._refuse_in_alarm()
@@ -142,7 +142,8 @@ class VirtualWorld(Motion):
                 found = "; ".join(map(str, known)) or "nothing"
                 raise InstrumentError(
                     f"The machine follows a schedule: expected {event} at {at:g} s in it; found {found}. State the "
-                    "same events in both schedules"
+                    "same events in both schedules",
+                    code="simulator.schedule.differs",
                 )
 
     def _restart(self, time: float, position: ArrayLike) -> None:
@@ -197,7 +198,7 @@ class VirtualWorld(Motion):
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""
         if not seconds >= 0:
-            raise InstrumentError(f"Expected a time of at least 0 s; found {seconds} s")
+            raise InstrumentError(f"Expected a time of at least 0 s; found {seconds} s", code="simulator.time.negative")
         with self._change:
             self._refuse_while_streaming("advance the time")
             self._set_clock(self.time + seconds)
@@ -215,7 +216,10 @@ class VirtualWorld(Motion):
         """Turn the spindle at a speed from a time on; return the event in the machine's schedule, if any."""
         if self._follows is not None:
             if not 0 <= speed <= self.machine.top_speed:
-                raise InstrumentError(f"The spindle turns at up to {self.machine.top_speed:g} /min; found {speed:g}")
+                raise InstrumentError(
+                    f"The spindle turns at up to {self.machine.top_speed:g} /min; found {speed:g}",
+                    code="machine.spindle.too_fast",
+                )
             self._commanded = speed
             return None
         event = Event(time, spindle_speed=speed)
@@ -293,7 +297,10 @@ class VirtualWorld(Motion):
         """Move the trackers beside the machine to a position in its coordinates, m."""
         trackers = [device for device in self._devices if isinstance(device, Carried)]
         if not trackers:
-            raise InstrumentError("This machine has no tracker; open one first, at the same machine and seed")
+            raise InstrumentError(
+                "This machine has no tracker; open one first, at the same machine and seed",
+                code="simulator.tracker.missing",
+            )
         with self._change:
             self._refuse_while_streaming("move a tracker")
         for tracker in trackers:

@@ -34,7 +34,7 @@ def decode(line: bytes) -> str:
     """Return the text of an answer without its line end; ProtocolError if it is not printable ASCII."""
     text = line.rstrip(b"\r\n")
     if len(text) > LONGEST or any(not 0x20 <= byte <= 0x7E for byte in text):
-        raise ProtocolError(f"Expected a line of printable ASCII; found {text[:60]!r}")
+        raise ProtocolError(f"Expected a line of printable ASCII; found {text[:60]!r}", code="protocol.text.form")
     return text.decode("ascii").strip()
 
 
@@ -61,12 +61,18 @@ def parse_channels(text: str) -> list[int]:
     digits = text[2 : 2 + int(match[1])] if match else ""
     body = text[2 + len(digits) :]
     if not digits.isascii() or not digits.isdigit() or len(body) != int(digits):
-        raise ProtocolError(f"Expected a scan list such as '#214(@101,102,103)'; found '{text[:60]}'")
+        raise ProtocolError(
+            f"Expected a scan list such as '#214(@101,102,103)'; found '{text[:60]}'", code="protocol.scan_list.form"
+        )
     if not (body.startswith("(@") and body.endswith(")")):
-        raise ProtocolError(f"Expected a scan list such as '(@101,102,103)'; found '{body[:60]}'")
+        raise ProtocolError(
+            f"Expected a scan list such as '(@101,102,103)'; found '{body[:60]}'", code="protocol.scan_list.form"
+        )
     cells = body[2:-1].split(",") if body != "(@)" else []
     if not all(_CHANNEL.fullmatch(cell) for cell in cells):
-        raise ProtocolError(f"Expected channels of three or four digits; found '{body[:60]}'")
+        raise ProtocolError(
+            f"Expected channels of three or four digits; found '{body[:60]}'", code="protocol.scan_list.form"
+        )
     return [int(cell) for cell in cells]
 
 
@@ -74,7 +80,10 @@ def parse_identity(text: str) -> tuple[str, str, str, str]:
     """Return manufacturer, model, serial number and revision in an answer to ``*IDN?``; else ProtocolError."""
     cells = [cell.strip() for cell in text.split(",")]
     if len(cells) != 4 or not _NAME.search(cells[0]) or not cells[1]:
-        raise ProtocolError(f"'*IDN?': expected manufacturer, model, serial number and revision; found '{text[:80]}'")
+        raise ProtocolError(
+            f"'*IDN?': expected manufacturer, model, serial number and revision; found '{text[:80]}'",
+            code="protocol.reply.identity",
+        )
     return cells[0], cells[1], cells[2], cells[3]
 
 
@@ -88,7 +97,9 @@ def parse_error(text: str) -> tuple[int, str]:
     """
     match = _ERROR.fullmatch(text)
     if match is None:
-        raise ProtocolError(f"'SYST:ERR?': expected a number and a text in quotes; found '{text[:80]}'")
+        raise ProtocolError(
+            f"'SYST:ERR?': expected a number and a text in quotes; found '{text[:80]}'", code="protocol.reply.form"
+        )
     return int(match[1]), match[2]
 
 
@@ -106,7 +117,8 @@ def parse_readings(text: str) -> list[tuple[int, float]]:
     pairs = list(zip(cells[::2], cells[1::2], strict=False))
     if len(cells) % 2 or not all(_NUMBER.fullmatch(a.strip()) and _CHANNEL.fullmatch(b.strip()) for a, b in pairs):
         raise ProtocolError(
-            f"'READ?': expected readings, each with its channel, such as '+2.61950000E+01,101'; found '{text[:80]}'"
+            f"'READ?': expected readings, each with its channel, such as '+2.61950000E+01,101'; found '{text[:80]}'",
+            code="protocol.reply.number_form",
         )
     return [(int(channel), _reading(float(number))) for number, channel in pairs]
 

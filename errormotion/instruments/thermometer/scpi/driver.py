@@ -56,7 +56,8 @@ class ScpiTemperature(LineThermometer):
         if model not in self.settings.models:
             raise InstrumentError(
                 f"{self.address}: expected one of {', '.join(self.settings.models)}; found a {manufacturer} {model}. "
-                "Add it to 'models' if it has the same commands"
+                "Add it to 'models' if it has the same commands",
+                code="instrument.model.unknown",
             )
         return Identity(
             manufacturer=manufacturer,
@@ -102,7 +103,8 @@ class ScpiTemperature(LineThermometer):
         if sorted(found) != sorted(self.settings.numbers):
             raise ProtocolError(
                 f"{self.address}: expected one reading of each of the channels "
-                f"{codec.channel_list(sorted(self.settings.numbers))}; found {codec.channel_list(found)}"
+                f"{codec.channel_list(sorted(self.settings.numbers))}; found {codec.channel_list(found)}",
+                code="thermometer.channels.differ",
             )
         return dict(pairs)
 
@@ -127,7 +129,8 @@ class ScpiTemperature(LineThermometer):
                 wanted = codec.channel_list(sorted(self.settings.numbers))
                 raise InstrumentError(
                     f"{self.address}: expected the scan list {wanted}; found {codec.channel_list(scanned)}. Set "
-                    "'inputs' to it, or 'setup' to true"
+                    "'inputs' to it, or 'setup' to true",
+                    code="thermometer.scan_list.differs",
                 )
         self._ready = True
 
@@ -138,7 +141,9 @@ class ScpiTemperature(LineThermometer):
             line.write(codec.encode("SYST:ERR?"))
             number, text = self._answer(line, "SYST:ERR?", codec.parse_error)
         if number:
-            raise InstrumentError(f"{self.address}: the unit refuses '{command}': {number} {text}")
+            raise InstrumentError(
+                f"{self.address}: the unit refuses '{command}': {number} {text}", code="instrument.refused"
+            )
 
     def _query(self, command: str, parse: Callable[[str], T]) -> T:
         with self.exchange() as line:
@@ -149,7 +154,7 @@ class ScpiTemperature(LineThermometer):
         try:
             return parse(codec.decode(line.read_until(LINE_ENDS, limit=codec.LONGEST)))
         except InstrumentTimeoutError as error:
-            raise InstrumentTimeoutError(f"'{command}': {error}") from None
+            raise InstrumentTimeoutError(f"'{command}': {error}", code=error.code) from None
 
     def resynchronise(self) -> None:
         """Discard late answers; even later ones precede the identity of the unit.

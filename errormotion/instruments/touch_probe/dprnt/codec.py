@@ -49,7 +49,9 @@ def from_iso_code(raw: bytes) -> bytes:
         A character with an odd number of ones.
     """
     if any(code.bit_count() & 1 for code in raw):
-        raise ProtocolError(f"Expected characters with even parity (ISO code); found {raw[:60]!r}")
+        raise ProtocolError(
+            f"Expected characters with even parity (ISO code); found {raw[:60]!r}", code="protocol.text.parity"
+        )
     return bytes(code & 0x7F for code in raw)
 
 
@@ -64,7 +66,7 @@ def text_of(raw: bytes) -> str:
     try:
         return raw.strip(_CONTROL).decode("ascii").strip()
     except UnicodeDecodeError:
-        raise ProtocolError(f"Expected a line of text; found {raw[:60]!r}") from None
+        raise ProtocolError(f"Expected a line of text; found {raw[:60]!r}", code="protocol.text.form") from None
 
 
 def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time: float = MILLISECONDS) -> Line:
@@ -84,17 +86,24 @@ def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time:
         The line is longer than `MAX_LINE`, or does not match the pattern.
     """
     if len(text) > MAX_LINE:
-        raise ProtocolError(f"Expected a line of at most {MAX_LINE} characters; found {len(text)}: '{text[:60]}'")
+        raise ProtocolError(
+            f"Expected a line of at most {MAX_LINE} characters; found {len(text)}: '{text[:60]}'",
+            code="protocol.reply.too_long",
+        )
     found = pattern.fullmatch(text.strip())
     if found is None:
-        raise ProtocolError(f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'")
+        raise ProtocolError(
+            f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'", code="protocol.touch.form"
+        )
     groups = found.groupdict()
     try:
         x, y, z = (_value(groups[name]) * length for name in "xyz")
         number = int(groups["number"]) if groups.get("number") else None
         seconds = _value(groups["time"]) * time if groups.get("time") else math.nan
     except (TypeError, ValueError):
-        raise ProtocolError(f"Expected numbers X, Y, Z in the line; found '{text[:60]}'") from None
+        raise ProtocolError(
+            f"Expected numbers X, Y, Z in the line; found '{text[:60]}'", code="protocol.touch.form"
+        ) from None
     return Line((x, y, z), number, seconds)
 
 

@@ -125,7 +125,7 @@ class Dprnt(Probe, Driver):
                 index = touch_of(line, touches, due, self._before, self.settings.first_number, self.settings.margin)
             except InstrumentError as error:
                 self._unfinished_from = max(due, self._unfinished_from)
-                raise type(error)(f"{where}: {error}") from error
+                raise error.restated(f"{where}: {error}") from error
             if index == REPEATED:
                 self.repeated += 1
                 continue
@@ -165,7 +165,7 @@ class Dprnt(Probe, Driver):
                     return parse_line(text, pattern, length=units[0], time=units[1])
             except InstrumentTimeoutError as error:
                 raise InstrumentTimeoutError(
-                    f"no line for {timeout:g} s; check the program and the cable. {error}"
+                    f"no line for {timeout:g} s; check the program and the cable. {error}", code="instrument.no_answer"
                 ) from error
             except ProtocolError as error:
                 self.unreadable += 1
@@ -173,7 +173,8 @@ class Dprnt(Probe, Driver):
                 if self.unreadable - unreadable > self.settings.most_unreadable:
                     raise ProtocolError(
                         f"{self.unreadable - unreadable} lines cannot be read; check baud rate and pattern. "
-                        f"The last one: {error}"
+                        f"The last one: {error}",
+                        code="protocol.lines.unreadable",
                     ) from error
 
     def _start_session(self) -> None:

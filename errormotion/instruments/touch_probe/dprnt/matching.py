@@ -31,7 +31,8 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
         if not is_on_path(line, touches[index], margin):
             raise InstrumentError(
                 f"touch {line.number} was printed at {_text(line)}, which is not on the path of touch {index + 1}; "
-                "check that program and touches agree, and the unit"
+                "check that program and touches agree, and the unit",
+                code="touch.path.other",
             )
         return index
     candidates = [*range(due, len(touches)), *range(due)]
@@ -42,7 +43,8 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
     if not found:
         raise InstrumentError(
             f"a contact was printed at {_text(line)}, which is on the path of no touch; check that program and "
-            "touches agree, and the unit of lengths"
+            "touches agree, and the unit of lengths",
+            code="touch.path.none",
         )
     return found[0]
 

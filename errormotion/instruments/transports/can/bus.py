@@ -61,7 +61,9 @@ def open_can(
             end=frames.close,
         )
     if address.scheme not in (CAN, "sim"):
-        raise InstrumentError(f"Expected an address on a CAN bus, such as can://socketcan/can0?node=5; found '{url}'")
+        raise InstrumentError(
+            f"Expected an address on a CAN bus, such as can://socketcan/can0?node=5; found '{url}'", code="address.form"
+        )
     number = _number(address, node)
     device = load_simulator(simulator, url)(address) if address.scheme == "sim" else None
     try:
@@ -92,5 +94,5 @@ def open_can(
 def _number(address: Address, node: int) -> int:
     number = address.whole("node", node, 127)
     if number == 0:
-        raise InstrumentError(f"'node' in '{address.url}': expected 1 to 127; found 0")
+        raise InstrumentError(f"'node' in '{address.url}': expected 1 to 127; found 0", code="address.number")
     return number

@@ -107,7 +107,9 @@ class Network:
         try:
             self._bus = can.Bus(interface=address.host, channel=address.path, ignore_config=True, **further)  # type: ignore[arg-type]
         except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-            raise InstrumentError(f"The CAN bus '{address.url}' cannot be opened: {error}") from None
+            raise InstrumentError(
+                f"The CAN bus '{address.url}' cannot be opened: {error}", code="connection.not_opened"
+            ) from None
 
     def _listen(self) -> None:
         while not self._stopped.is_set():

@@ -127,11 +127,11 @@ class CanNode(Transport):
         try:
             return self._guarded(lambda: self._sdo.upload(index, subindex))
         except SdoRefusal as refusal:
-            raise SdoRefusal(refusal.code, f"{self._where}, {what}") from None
+            raise SdoRefusal(refusal.number, f"{self._where}, {what}") from None
         except InstrumentTimeoutError:
             raise after_others(self._silence("did not answer"), self._sdo.others, what) from None
         except ProtocolError as error:
-            raise ProtocolError(f"{self._where}, {what}: {error}") from None
+            raise ProtocolError(f"{self._where}, {what}: {error}", code=error.code) from None
 
     def unsigned(self, index: int, subindex: int = 0, size: int = 4) -> int:
         """Return an entry that is an unsigned number of 1 to ``size`` bytes; errors as for `upload`.
@@ -142,7 +142,8 @@ class CanNode(Transport):
         if not 1 <= len(data) <= 4:
             found = f"{len(data)} bytes"
             raise ProtocolError(
-                f"{self._where}, 0x{index:04X}:{subindex}: expected a number of 1 to 4 bytes; found {found}"
+                f"{self._where}, 0x{index:04X}:{subindex}: expected a number of 1 to 4 bytes; found {found}",
+                code="protocol.value.form",
             )
         return int.from_bytes(data[:size], "little")
 
@@ -231,7 +232,7 @@ class CanNode(Transport):
     def _silence(self, what: str, timeout: float | None = None) -> InstrumentTimeoutError:
         seen = f"its last heartbeat stated {self.state}" if self.state else "no heartbeat was received"
         limit = self.timeout if timeout is None else timeout
-        return InstrumentTimeoutError(f"{self._where} {what} within {limit:g} s; {seen}")
+        return InstrumentTimeoutError(f"{self._where} {what} within {limit:g} s; {seen}", code="instrument.no_answer")
 
     def _event_timer(self, number: int) -> float:
         try:
@@ -249,12 +250,12 @@ class CanNode(Transport):
             raise
         except (can.CanError, OSError) as error:
             self._drop_bus(f"{self.url}: the bus is lost: {error}")
-            raise InstrumentError(self._bus.reason) from None
+            raise InstrumentError(self._bus.reason, code="connection.lost") from None
 
     def _check(self, network: Network) -> None:
         if network.failed:
             self._drop_bus(f"{self.url}: {network.failed}")
-            raise InstrumentError(self._bus.reason)
+            raise InstrumentError(self._bus.reason, code="connection.lost")
 
     def _opened(self) -> Network:
         network = self._connect()
@@ -300,10 +301,10 @@ class CanNode(Transport):
             lost.close()
 
     def _send(self, data: bytes) -> None:  # noqa: ARG002
-        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes")
+        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes", code="connection.no_bytes")
 
     def _receive(self, max_bytes: int, timeout: float) -> bytes:  # noqa: ARG002
-        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes")
+        raise InstrumentError(f"{self.url} transports CAN frames, not a stream of bytes", code="connection.no_bytes")
 
     def close(self) -> None:
         """Leave the bus; idempotent."""

@@ -51,7 +51,9 @@ class Mapped:
         """
         if len(frame) * 8 < self.offset + self.bits:
             found = frame.hex(" ") or "none"
-            raise ProtocolError(f"a PDO with 0x{self.index:04X}:{self.subindex} is too short; found {found}")
+            raise ProtocolError(
+                f"a PDO with 0x{self.index:04X}:{self.subindex} is too short; found {found}", code="protocol.can.pdo"
+            )
         number = int.from_bytes(frame, "little") >> self.offset & (1 << self.bits) - 1
         return number.to_bytes(-(-self.bits // 8), "little")
 
@@ -117,7 +119,10 @@ def decode_mapping(entries: Sequence[int]) -> tuple[Mapped, ...]:
     for entry in entries:
         bits = entry & 0xFF
         if not 0 < bits <= FRAME_BITS - offset:
-            raise ProtocolError(f"the mapping 0x{entry:08X} does not fit a frame of {FRAME_BITS} bits at bit {offset}")
+            raise ProtocolError(
+                f"the mapping 0x{entry:08X} does not fit a frame of {FRAME_BITS} bits at bit {offset}",
+                code="protocol.can.mapping",
+            )
         mapped.append(Mapped(entry >> 16 & 0xFFFF, entry >> 8 & 0xFF, offset, bits))
         offset += bits
     return tuple(mapped)

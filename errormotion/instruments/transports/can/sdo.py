@@ -70,14 +70,16 @@ class SdoRefusal(InstrumentError):  # noqa: N818 - a refusal is an answer
 
     Attributes
     ----------
-    code : int
+    number : int
         SDO abort code.
     """
 
-    def __init__(self, code: int, what: str) -> None:
-        self.code = code
-        meaning = f", {ABORTS[code]}" if code in ABORTS else ""
-        super().__init__(f"{what} is refused: Code 0x{code:08X}{meaning}")
+    code = "can.sdo.refused"
+
+    def __init__(self, number: int, what: str) -> None:
+        self.number = number
+        meaning = f", {ABORTS[number]}" if number in ABORTS else ""
+        super().__init__(f"{what} is refused: Code 0x{number:08X}{meaning}")
 
 
 def upload_request(index: int, subindex: int) -> bytes:
@@ -112,11 +114,13 @@ def upload_reply(frame: bytes, index: int, subindex: int) -> bytes | int | None:
         The frame is not such an answer.
     """
     if len(frame) != FRAME_BYTES:
-        raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
+        raise ProtocolError(
+            f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}", code="protocol.can.form"
+        )
     command, at, sub, number = struct.unpack("<BHBI", frame)
     kind = command & 0xE0
     if kind not in (_UPLOAD, _ABORT):
-        raise ProtocolError(f"{frame.hex(' ')} is not an answer to an SDO upload")
+        raise ProtocolError(f"{frame.hex(' ')} is not an answer to an SDO upload", code="protocol.can.form")
     if (at, sub) != (index, subindex):
         return None
     if kind == _ABORT:
@@ -137,7 +141,9 @@ def segment_reply(frame: bytes, toggle: int) -> tuple[bytes, bool] | None:
         The frame is not such an answer.
     """
     if len(frame) != FRAME_BYTES:
-        raise ProtocolError(f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}")
+        raise ProtocolError(
+            f"an SDO answer has {FRAME_BYTES} bytes; found {frame.hex(' ') or 'none'}", code="protocol.can.form"
+        )
     command = frame[0]
     if command & 0xE0 == _ABORT:
         at, sub, code = struct.unpack("<HBI", frame[1:])
@@ -220,7 +226,7 @@ class SdoClient:
                 break
             self.late += 1
         else:
-            raise ProtocolError(f"{MAX_STRAY} answers to other requests")
+            raise ProtocolError(f"{MAX_STRAY} answers to other requests", code="protocol.reply.other")
         data = reply if isinstance(reply, bytes) else self._segments(index, subindex, reply)
         self._settled = True
         return data
@@ -245,18 +251,22 @@ class SdoClient:
                 raise self._ended(index, subindex, "received a segment without data")
             toggle ^= 1
         if size and len(data) != size:
-            raise ProtocolError(f"0x{index:04X}:{subindex}: expected {size} bytes; received {len(data)}")
+            raise ProtocolError(
+                f"0x{index:04X}:{subindex}: expected {size} bytes; received {len(data)}", code="protocol.reply.length"
+            )
         return data
 
     def _ended(self, index: int, subindex: int, why: str) -> ProtocolError:
         self._send(abort_request(index, subindex, GENERAL), None)
-        return ProtocolError(f"0x{index:04X}:{subindex}: {why}")
+        return ProtocolError(f"0x{index:04X}:{subindex}: {why}", code="protocol.can.form")
 
     def _next(self, end: float) -> bytes:
         try:
             return self.answers.get(timeout=max(end - time.monotonic(), 0.0))
         except queue.Empty:
-            raise InstrumentTimeoutError(f"no SDO answer within {self.timeout:g} s") from None
+            raise InstrumentTimeoutError(
+                f"no SDO answer within {self.timeout:g} s", code="instrument.no_answer"
+            ) from None
 
     def _forget(self) -> None:
         while True:

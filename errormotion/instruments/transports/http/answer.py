@@ -24,6 +24,8 @@ _CHUNK_SIZE = re.compile(rb"([0-9A-Fa-f]{1,8})[ \t]*(?:;.*)?")
 class CutOffError(ProtocolError):
     """The connection ended within a body in chunks."""
 
+    code = "protocol.http.incomplete"
+
 
 Read = Callable[[float], bytes]
 """``read(timeout)`` returns bytes as soon as any are available, no bytes at the end of the connection."""
@@ -70,7 +72,9 @@ class Input:
 
     def _check(self) -> None:
         if time.monotonic() >= self.deadline:
-            raise InstrumentTimeoutError(f"{self._url}: the answer was not complete within the time limit") from None
+            raise InstrumentTimeoutError(
+                f"{self._url}: the answer was not complete within the time limit", code="instrument.no_answer"
+            ) from None
 
     def line(self) -> bytes | None:
         """Return the next line without its line end; None at the end of the connection."""
@@ -78,13 +82,21 @@ class Input:
         while (end := self._buffer.find(b"\n", start)) < 0:
             start = len(self._buffer)
             if start > MAX_LINE_BYTES:
-                raise ProtocolError(f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}")
+                raise ProtocolError(
+                    f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}",
+                    code="protocol.http.line",
+                )
             if not self.fill():
                 if self._buffer:
-                    raise ProtocolError(f"{self._url}: the connection ended within a line: {self._start()}")
+                    raise ProtocolError(
+                        f"{self._url}: the connection ended within a line: {self._start()}",
+                        code="protocol.http.incomplete",
+                    )
                 return None
         if end > MAX_LINE_BYTES:
-            raise ProtocolError(f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}")
+            raise ProtocolError(
+                f"{self._url}: a line longer than {MAX_LINE_BYTES} bytes: {self._start()}", code="protocol.http.line"
+            )
         return self.some(end + 1).rstrip(b"\r\n")
 
     def some(self, most: int) -> bytes:
@@ -132,13 +144,20 @@ class Head:
             if self.status >= 200:
                 break
         else:
-            raise ProtocolError(f"{url}: expected a final HTTP answer; found only interim ones")
+            raise ProtocolError(
+                f"{url}: expected a final HTTP answer; found only interim ones", code="protocol.http.form"
+            )
         connection = self.headers.get("connection", "").lower()
         coding = self.headers.get("transfer-encoding", "identity").strip().lower()
         if coding not in ("identity", "chunked"):
-            raise ProtocolError(f"{url}: expected a body without transfer coding, or in chunks; found '{coding[:40]}'")
+            raise ProtocolError(
+                f"{url}: expected a body without transfer coding, or in chunks; found '{coding[:40]}'",
+                code="protocol.http.coding",
+            )
         if (content := self.headers.get("content-encoding", "identity").strip().lower()) != "identity":
-            raise ProtocolError(f"{url}: expected a body that is not compressed; found '{content[:40]}'")
+            raise ProtocolError(
+                f"{url}: expected a body that is not compressed; found '{content[:40]}'", code="protocol.http.coding"
+            )
         self._chunked = coding == "chunked"
         self._left = self._length()
         self._first_chunk = True
@@ -163,9 +182,14 @@ class Head:
         while data := self.some(limit + 1 - len(found)):
             found += data
             if len(found) > limit:
-                raise ProtocolError(f"{self._url}: the answer is larger than {limit} bytes")
+                raise ProtocolError(
+                    f"{self._url}: the answer is larger than {limit} bytes", code="protocol.reply.too_long"
+                )
         if self.missing:
-            raise ProtocolError(f"{self._url}: the answer is incomplete: {self.missing} bytes are missing")
+            raise ProtocolError(
+                f"{self._url}: the answer is incomplete: {self.missing} bytes are missing",
+                code="protocol.http.incomplete",
+            )
         return bytes(found)
 
     def some(self, most: int) -> bytes:
@@ -181,11 +205,14 @@ class Head:
     def _next_chunk(self) -> bool:
         """Read the size of the next chunk; False after the last."""
         if not self._first_chunk and self._chunk_line() != b"":
-            raise ProtocolError(f"{self._url}: the answer is damaged at the end of a chunk")
+            raise ProtocolError(f"{self._url}: the answer is damaged at the end of a chunk", code="protocol.http.chunk")
         self._first_chunk = False
         line = self._chunk_line()
         if not (found := _CHUNK_SIZE.fullmatch(line)):
-            raise ProtocolError(f"{self._url}: the answer is damaged: expected a chunk size; found {line[:40]!r}")
+            raise ProtocolError(
+                f"{self._url}: the answer is damaged: expected a chunk size; found {line[:40]!r}",
+                code="protocol.http.chunk",
+            )
         self._left = int(found[1], 16)
         if not self._left:
             self._fields()  # the trailer
@@ -205,7 +232,9 @@ class Head:
         if text is None:
             return math.inf
         if not re.fullmatch("[0-9]{1,18}", text):
-            raise ProtocolError(f"{self._url}: expected the length of the body; found '{text[:40]}'")
+            raise ProtocolError(
+                f"{self._url}: expected the length of the body; found '{text[:40]}'", code="protocol.http.length"
+            )
         return int(text)
 
     def _status_line(self) -> tuple[int, int]:
@@ -214,7 +243,7 @@ class Head:
             raise EOFError
         found = _STATUS_LINE.fullmatch(line.decode("latin-1"))
         if not found:
-            raise ProtocolError(f"{self._url}: expected an HTTP answer; found {line[:80]!r}")
+            raise ProtocolError(f"{self._url}: expected an HTTP answer; found {line[:80]!r}", code="protocol.http.form")
         return int(found[1]), int(found[2])
 
     def _fields(self) -> dict[str, str]:
@@ -233,15 +262,19 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
     for _ in range(MAX_HEAD_LINES + 1):
         line = next_line()
         if line is None:
-            raise ProtocolError(f"{url}: the connection ended within the head of an answer or part")
+            raise ProtocolError(
+                f"{url}: the connection ended within the head of an answer or part", code="protocol.http.incomplete"
+            )
         if not line:
             return found
         name, _, value = line.decode("latin-1").partition(":")
         key, text = name.strip().lower(), value.strip()
         if key == "content-length" and found.get(key, text) != text:
-            raise ProtocolError(f"{url}: two lengths of the body, '{found[key][:20]}' and '{text[:20]}'")
+            raise ProtocolError(
+                f"{url}: two lengths of the body, '{found[key][:20]}' and '{text[:20]}'", code="protocol.http.length"
+            )
         found[key] = text
-    raise ProtocolError(f"{url}: a head of more than {MAX_HEAD_LINES} lines")
+    raise ProtocolError(f"{url}: a head of more than {MAX_HEAD_LINES} lines", code="protocol.http.head")
 
 
 class Lines:
@@ -258,7 +291,8 @@ class Lines:
             start = len(self._buffer)
             if start > MAX_PART_LINE_BYTES:
                 raise ProtocolError(
-                    f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}"
+                    f"{self._url}: expected a header line of a part; found {bytes(self._buffer[:80])!r}",
+                    code="protocol.http.head",
                 )
             if not self._more(MAX_PART_LINE_BYTES):
                 return None  # an incomplete line is ignored

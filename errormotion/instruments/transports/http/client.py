@@ -93,7 +93,9 @@ class HttpTransport(Transport):
                 self.target, self.simulated = parse_address(replayed.recorded_address), replayed.simulated
                 self._line = replayed
             case _:
-                raise InstrumentError(f"Expected an address such as http://192.168.0.5:5000/device; found '{url}'")
+                raise InstrumentError(
+                    f"Expected an address such as http://192.168.0.5:5000/device; found '{url}'", code="address.form"
+                )
         try:
             self._connected()
             if recorder is not None:
@@ -166,13 +168,16 @@ class HttpTransport(Transport):
             return None
         if line != b"--" + boundary:
             raise ProtocolError(
-                f"{self.url}: expected the boundary {b'--' + boundary!r} of a part; found {line[:80]!r}"
+                f"{self.url}: expected the boundary {b'--' + boundary!r} of a part; found {line[:80]!r}",
+                code="protocol.http.boundary",
             )
         source.deadline = self._deadline()
         text = header_fields(lines.line, self.url).get("content-length", "")
         size = int(text) if text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS else None
         if size is None or size > limit:
-            raise ProtocolError(f"{self.url}: expected a part of 0 to {limit} bytes; found {size}")
+            raise ProtocolError(
+                f"{self.url}: expected a part of 0 to {limit} bytes; found {size}", code="protocol.http.length"
+            )
         return lines.block(size)
 
     def _response(self, path: str, query: Mapping[str, str] | None, *, keep: bool) -> tuple[Head, Input]:
@@ -194,7 +199,8 @@ class HttpTransport(Transport):
                 self._disconnect()
                 if fresh:
                     raise InstrumentError(
-                        f"The connection to {self.url} is lost: the server closed it without an answer"
+                        f"The connection to {self.url} is lost: the server closed it without an answer",
+                        code="connection.lost",
                     ) from None
                 continue  # the server had closed an idle connection
             except BaseException:
@@ -206,7 +212,8 @@ class HttpTransport(Transport):
                 there = response.headers.get("location", "")[:200]
                 raise ProtocolError(
                     f"The server at {self.url} redirects '{target}' (HTTP status {response.status}) to '{there}'. "
-                    "Redirections are not followed: if the device is there, state this address"
+                    "Redirections are not followed: if the device is there, state this address",
+                    code="protocol.http.redirected",
                 )
             return response, source
 
@@ -282,6 +289,8 @@ class HttpTransport(Transport):
 
 class _EndedError(InstrumentError):
     """The server has closed the connection."""
+
+    code = "connection.lost"
 
 
 def _content_type(response: Head) -> str:

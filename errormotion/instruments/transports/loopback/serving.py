@@ -92,7 +92,8 @@ def not_listening(host: str, port: int, error: Exception) -> InstrumentError:
     reason = getattr(error, "strerror", None) or error
     return InstrumentError(
         f"The simulated device cannot listen at {host}:{port}: {reason}. Choose another port, or an address of this "
-        "computer"
+        "computer",
+        code="simulator.not_listening",
     )
 
 
@@ -366,4 +367,6 @@ def make_server(
         return TcpServer(name, on_data, on_connection)
     if wire == "pty":
         return PtyServer(name, on_data, on_connection)
-    raise InstrumentError(f"Expected 'wire=tcp' or 'wire=pty' for a simulated device; found 'wire={wire}'")
+    raise InstrumentError(
+        f"Expected 'wire=tcp' or 'wire=pty' for a simulated device; found 'wire={wire}'", code="simulator.wire.unknown"
+    )

@@ -35,7 +35,10 @@ class SimulatedTransport(Transport):
         """Open a further line of the same device; InstrumentError if it has none with this name."""
         urls = getattr(self._device, "urls", {})
         if name not in urls:
-            raise InstrumentError(f"The simulated device at {self.url} has no line '{name}'; it has: {', '.join(urls)}")
+            raise InstrumentError(
+                f"The simulated device at {self.url} has no line '{name}'; it has: {', '.join(urls)}",
+                code="simulator.line.missing",
+            )
         line = copy(self)
         line._inner = self._connect(urls[name])
         return line

@@ -138,11 +138,11 @@ class ModbusLine(Transport):
                     return found
                 others += 1
         except ModbusRefusal as error:
-            raise ModbusRefusal(error.code, f"{self.url}: {what}") from None
+            raise ModbusRefusal(error.number, f"{self.url}: {what}") from None
         except ProtocolError as error:
             self._settle()
             echo = ". The line returns the request: set 'echo' to true" if answer and asked.startswith(answer) else ""
-            raise ProtocolError(f"{self.url}: {error}{echo}") from None
+            raise ProtocolError(f"{self.url}: {error}{echo}", code=error.code) from None
         except InstrumentTimeoutError as error:
             self._unanswered_at, self._passed_over = time.monotonic(), False
             disconnect_after_timeout(self._line)
@@ -188,7 +188,9 @@ class ModbusLine(Transport):
             except ProtocolError:
                 continue
             return
-        raise ProtocolError(f"{self.url}: {MAX_LATE_ANSWERS} answers to earlier requests; expected one")
+        raise ProtocolError(
+            f"{self.url}: {MAX_LATE_ANSWERS} answers to earlier requests; expected one", code="protocol.reply.other"
+        )
 
     def _frame(self, end: float) -> bytes:
         """Return one answer, with the length stated in its start."""
@@ -199,10 +201,12 @@ class ModbusLine(Transport):
             except InstrumentTimeoutError:
                 if data:
                     raise ProtocolError(
-                        f"Expected {lacking} more bytes within {self.timeout:g} s; found {data[:24].hex(' ')}"
+                        f"Expected {lacking} more bytes within {self.timeout:g} s; found {data[:24].hex(' ')}",
+                        code="protocol.reply.length",
                     ) from None
                 raise InstrumentTimeoutError(
-                    f"{self.url}: unit {self.unit} did not answer within {self.timeout:g} s"
+                    f"{self.url}: unit {self.unit} did not answer within {self.timeout:g} s",
+                    code="instrument.no_answer",
                 ) from None
         return data
 
@@ -274,12 +278,15 @@ def framing_of(address: Address) -> Framing:
         serial = address.params.get("wire") == "pty"
         framing = address.params.get("framing", "rtu" if serial else "tcp")
         if framing not in ("tcp", "rtu") or (serial and framing == "tcp"):
-            raise InstrumentError(f"'framing' in '{address.url}': expected 'tcp' or 'rtu', and 'rtu' on a pty")
+            raise InstrumentError(
+                f"'framing' in '{address.url}': expected 'tcp' or 'rtu', and 'rtu' on a pty", code="address.form"
+            )
         return "rtu" if framing == "rtu" else "tcp"
     if address.scheme not in MODBUS:
         raise InstrumentError(
             f"Expected an address for Modbus, such as modbus+tcp://HOST:502?unit=1, modbus+rtu:///dev/NAME?unit=1 or "
-            f"modbus+rtu-tcp://HOST:PORT?unit=1; found '{address.url}'"
+            f"modbus+rtu-tcp://HOST:PORT?unit=1; found '{address.url}'",
+            code="address.form",
         )
     return "tcp" if address.scheme == "modbus+tcp" else "rtu"
 

@@ -134,7 +134,9 @@ def decode_answer(
     if pdu is None:
         return None
     if pdu[1] != 2 * count or len(pdu) != 2 + 2 * count:
-        raise ProtocolError(f"Expected {count} registers; found {len(pdu) - 2} bytes: {_hex(data)}")
+        raise ProtocolError(
+            f"Expected {count} registers; found {len(pdu) - 2} bytes: {_hex(data)}", code="protocol.reply.length"
+        )
     return list(_decoded(pdu, data).registers)
 
 
@@ -158,7 +160,10 @@ def decode_written(
         expected = WriteSingleRegisterResponse(address=register, registers=list(values))
     confirmation = bytes((function,)) + expected.encode()
     if pdu != confirmation:
-        raise ProtocolError(f"Expected the confirmation {confirmation.hex(' ')}; found {_hex(data)}")
+        raise ProtocolError(
+            f"Expected the confirmation {confirmation.hex(' ')}; found {_hex(data)}",
+            code="protocol.modbus.confirmation",
+        )
     return list(values)
 
 
@@ -167,13 +172,15 @@ class ModbusRefusal(InstrumentError):  # noqa: N818 - a refusal is an answer
 
     Attributes
     ----------
-    code : int
+    number : int
         Exception code of Modbus.
     """
 
-    def __init__(self, code: int, what: str) -> None:
-        self.code = code
-        super().__init__(f"{what} is refused: exception {code} ({EXCEPTIONS.get(code, 'unknown')})")
+    code = "modbus.refused"
+
+    def __init__(self, number: int, what: str) -> None:
+        self.number = number
+        super().__init__(f"{what} is refused: exception {number} ({EXCEPTIONS.get(number, 'unknown')})")
 
 
 def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -> bytes | None:
@@ -183,13 +190,18 @@ def _pdu(framing: Framing, data: bytes, unit: int, function: int, number: int) -
         return None
     answered, pdu = found
     if answered != unit:
-        raise ProtocolError(f"Expected an answer of unit {unit}; found that of unit {answered}: {_hex(data)}")
+        raise ProtocolError(
+            f"Expected an answer of unit {unit}; found that of unit {answered}: {_hex(data)}",
+            code="protocol.modbus.unit",
+        )
     if pdu[0] == function | 0x80 and len(pdu) == 2:
         refusal = _decoded(pdu, data)
         assert isinstance(refusal, ExceptionResponse)
         raise ModbusRefusal(refusal.exception_code, f"Function {function} of unit {unit}")
     if pdu[0] != function:
-        raise ProtocolError(f"Expected an answer to function {function}; found {_hex(data)}")
+        raise ProtocolError(
+            f"Expected an answer to function {function}; found {_hex(data)}", code="protocol.modbus.form"
+        )
     return pdu
 
 
@@ -197,31 +209,40 @@ def _decoded(pdu: bytes, data: bytes) -> ModbusPDU:
     """Return the content of an answer whose length has been checked."""
     found = _DECODER.decode(pdu)
     if found is None:
-        raise ProtocolError(f"Expected an answer of Modbus; found {_hex(data)}")
+        raise ProtocolError(f"Expected an answer of Modbus; found {_hex(data)}", code="protocol.modbus.form")
     return found
 
 
 def _unframed_rtu(data: bytes) -> tuple[int, bytes]:
     if len(data) < _SHORTEST:
         raise ProtocolError(
-            f"Expected a Modbus answer of at least {_SHORTEST} bytes; found {data.hex(' ') or 'nothing'}"
+            f"Expected a Modbus answer of at least {_SHORTEST} bytes; found {data.hex(' ') or 'nothing'}",
+            code="protocol.reply.length",
         )
     if not FramerRTU.check_CRC(data[:-2], int.from_bytes(data[-2:], "big")):
         expected = crc16(data[:-2]).hex(" ")
-        raise ProtocolError(f"The answer {_hex(data)} has the checksum {data[-2:].hex(' ')}; expected {expected}")
+        raise ProtocolError(
+            f"The answer {_hex(data)} has the checksum {data[-2:].hex(' ')}; expected {expected}",
+            code="protocol.checksum",
+        )
     return data[0], data[1:-2]
 
 
 def _unframed_tcp(data: bytes, number: int) -> tuple[int, bytes] | None:
     if len(data) < _HEAD + 2:
-        raise ProtocolError(f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}")
+        raise ProtocolError(
+            f"Expected a Modbus answer of at least {_HEAD + 2} bytes; found {data.hex(' ')}",
+            code="protocol.reply.length",
+        )
     (answered, protocol, length), unit = _head(data), data[_HEAD - 1]
     if protocol or length != len(data) - 6:
-        raise ProtocolError(f"Expected the header of a Modbus answer; found {_hex(data)}")
+        raise ProtocolError(f"Expected the header of a Modbus answer; found {_hex(data)}", code="protocol.modbus.form")
     if answered != number:
         if (number - answered) % (1 << 16) < 1 << 15:
             return None
-        raise ProtocolError(f"Expected the answer to transaction {number}; found that to {answered}")
+        raise ProtocolError(
+            f"Expected the answer to transaction {number}; found that to {answered}", code="protocol.reply.number"
+        )
     return unit, data[_HEAD:]
 
 

@@ -13,7 +13,7 @@ from errormotion import plugins
 from errormotion.campaign.files import parse_bench, parse_campaign
 from errormotion.cli.commands.campaigns.init import asking
 from errormotion.cli.commands.campaigns.init.writing import Answers, Instrument, Test, bench_text, campaign_text
-from errormotion.cli.guard import USAGE
+from errormotion.cli.guard import UsageError
 from errormotion.cli.output import show, show_json
 from errormotion.datasets.files.tomltext import value_of
 from errormotion.datasets.files.writing import replace_text
@@ -58,18 +58,23 @@ def init(
     answers = _stated(machine, chain, travel, instruments, tests, assignments)
     targets = [folder / BENCH, folder / CAMPAIGN]
     if not force and (there := [str(path) for path in targets if path.exists()]):
-        raise BenchError(f"{' and '.join(there)}: already exists; give another folder, or --force to replace it")
+        raise BenchError(
+            f"{' and '.join(there)}: already exists; give another folder, or --force to replace it",
+            code="init.file.exists",
+        )
     if ask is None and sys.stdin.isatty() and sys.stderr.isatty() and not as_json:
         ask = _prompt
     if ask is not None:
         asking.complete(answers, ask)
     elif not answers.machine or not answers.instruments:
-        show("Expected --machine and at least one --instrument, as there is no terminal for questions.", err=True)
-        raise typer.Exit(USAGE)
+        raise UsageError(
+            "Expected --machine and at least one --instrument, as there is no terminal for questions.",
+            code="option.missing",
+        )
     try:
         texts = _checked(answers, folder)
     except ErrormotionError as error:
-        raise BenchError(f"{error}\nNothing was written.") from error
+        raise BenchError(f"{error}\nNothing was written.", code=error.code) from error
     folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         _write(path, text, force)
@@ -102,13 +107,16 @@ def _stated(
         name, _, rest = text.partition("=")
         driver, _, address = rest.partition("@")
         if not name.strip() or not driver.strip():
-            raise BenchError(f"--instrument {text}: expected NAME=ID@ADDRESS with the id of an instrument plugin")
+            raise BenchError(
+                f"--instrument {text}: expected NAME=ID@ADDRESS with the id of an instrument plugin",
+                code="init.instrument.form",
+            )
         plugins.get("instruments", driver.strip())
         answers.instruments[name.strip()] = Instrument(driver.strip(), address.strip())
     for text in tests:
         name, _, method = text.partition("=")
         if not name.strip() or not method.strip():
-            raise BenchError(f"--test {text}: expected NAME=ID with the id of a method plugin")
+            raise BenchError(f"--test {text}: expected NAME=ID with the id of a method plugin", code="init.test.form")
         plugins.get("methods", method.strip())
         answers.tests[name.strip()] = Test(method.strip())
     owners: dict[str, Any] = {**answers.instruments, **answers.tests}
@@ -118,7 +126,8 @@ def _stated(
         if not sign or owner not in owners or not key:
             known = ", ".join(owners) or "none"
             raise BenchError(
-                f"--set {text}: expected NAME.KEY=VALUE with the name of an instrument or a test ({known})"
+                f"--set {text}: expected NAME.KEY=VALUE with the name of an instrument or a test ({known})",
+                code="init.setting.form",
             )
         owners[owner].settings[key] = value_of(content.strip())
     return answers

@@ -287,7 +287,9 @@ class SimulatedAgent:
 def _choice(address: Address, name: str, default: str, known: set[str]) -> str:
     value = address.params.get(name, default)
     if value not in known:
-        raise InstrumentError(f"'{name}={value}' in '{address.url}': expected one of {', '.join(sorted(known))}")
+        raise InstrumentError(
+            f"'{name}={value}' in '{address.url}': expected one of {', '.join(sorted(known))}", code="simulator.setting"
+        )
     return value
 
 
@@ -297,5 +299,7 @@ def work_offset(address: Address, default: tuple[float, float, float]) -> tuple[
     try:
         x, y, z = default if text is None else (float(part) for part in text.split(","))
     except ValueError:
-        raise InstrumentError(f"'offset={text}' in '{address.url}': expected x,y,z in mm") from None
+        raise InstrumentError(
+            f"'offset={text}' in '{address.url}': expected x,y,z in mm", code="simulator.setting"
+        ) from None
     return x / 1e3, y / 1e3, z / 1e3

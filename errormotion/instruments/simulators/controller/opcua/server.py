@@ -53,7 +53,8 @@ class SimulatedServer:
         if self._style not in STYLES or self._units not in UNITS:
             raise InstrumentError(
                 f"'{address.url}': expected 'style' one of {', '.join(STYLES)}, 'units' one of {', '.join(UNITS)}; "
-                f"found '{self._style}', '{self._units}'"
+                f"found '{self._style}', '{self._units}'",
+                code="simulator.setting",
             )
         seed = int(address.number("seed", 0))
         rng = np.random.default_rng([abs(seed), *b"opcua"])

@@ -130,7 +130,9 @@ class Space:
         item.NodeClass = _class_of(attributes)  # not an argument in older versions of the package
         left = list(self._nodes.try_add_nodes([item], check=False))
         if left or node not in self._addresses:
-            raise InstrumentError(f"the simulated OPC UA server cannot add the node {node.to_string()}")
+            raise InstrumentError(
+                f"the simulated OPC UA server cannot add the node {node.to_string()}", code="simulator.node.not_added"
+            )
         return node
 
     def object(

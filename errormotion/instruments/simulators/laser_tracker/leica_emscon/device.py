@@ -50,7 +50,9 @@ class SimulatedEmScon(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, KeyError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a tracker: {error}") from None
+            raise InstrumentError(
+                f"'{address.url}' has invalid parameters of a tracker: {error}", code="simulator.setting"
+            ) from None
 
     def _set_up(self, address: Address) -> None:
         kind = address.params.get("tracker", "AT901")
@@ -176,7 +178,7 @@ class SimulatedEmScon(SimulatedDevice):
     def stream(self) -> PointStream:
         """The continuous measurement."""
         if self.points is None:
-            raise InstrumentError("The simulated tracker is not set up")
+            raise InstrumentError("The simulated tracker is not set up", code="simulator.not_set_up")
         return self.points
 
     @property

@@ -35,7 +35,9 @@ class SimulatedGeoComStation(SimulatedDevice):
             self._set_up(address)
         except (InstrumentError, KeyError, ValueError) as error:
             self.close()
-            raise InstrumentError(f"'{address.url}' has invalid parameters of a station: {error}") from None
+            raise InstrumentError(
+                f"'{address.url}' has invalid parameters of a station: {error}", code="simulator.setting"
+            ) from None
 
     def _set_up(self, address: Address) -> None:
         model = MODELS[address.params.get("model", "TS30")]

@@ -78,7 +78,8 @@ class SimulatedCapaNCDT(DataPortDevice):
         ranges = [float(text) for text in texts] or [self.world.machine.frame.range * 1e6]
         if not channels or len(beams) > CHANNELS or len(ranges) not in (1, len(channels)) or not min(ranges) > 0:
             raise InstrumentError(
-                f"expected 1 to {CHANNELS} 'beams', and one of the 'ranges' (um) for all or one for each"
+                f"expected 1 to {CHANNELS} 'beams', and one of the 'ranges' (um) for all or one for each",
+                code="simulator.setting",
             )
         ranges = ranges * len(channels) if len(ranges) == 1 else ranges
         self.serial = int(address.number("serial", 1000 + abs(self.world.seed)))
@@ -93,7 +94,7 @@ class SimulatedCapaNCDT(DataPortDevice):
         self.port = 0
         for command in address.params.get("left", "").split(";"):
             if command and (refused := answer(self, command)).startswith("$"):
-                raise InstrumentError(f"'left={command}': {refused}")
+                raise InstrumentError(f"'left={command}': {refused}", code="simulator.setting")
 
     def close(self) -> None:
         """End the device."""

@@ -73,11 +73,11 @@ class SimulatedConfocal(ConsoleDevice, DataPortDevice):
     def _set_up(self, address: Address) -> None:
         self.model_name = address.params.get("model", "IFC2451")
         if self.model_name not in MODELS:
-            raise InstrumentError(f"'model': expected one of {', '.join(MODELS)}")
+            raise InstrumentError(f"'model': expected one of {', '.join(MODELS)}", code="simulator.setting")
         self.model = MODELS[self.model_name]
         self.range = address.number("range", self.world.machine.frame.range * 1e3) * 1e-3
         if not 0.0 < self.range < 2.0:
-            raise InstrumentError("'range': expected more than 0 mm and less than 2000 mm")
+            raise InstrumentError("'range': expected more than 0 mm and less than 2000 mm", code="simulator.setting")
         self.serial = int(address.number("serial", 11020000 + abs(self.world.seed)))
         self._set_up_console(address)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))

@@ -39,11 +39,13 @@ class ConsoleDevice(SimulatedDevice):
             text = " ".join([name, *words])
             command = self._commands.get(name)
             if command is None or command.default is None:
-                raise InstrumentError(f"'left={text}': this device has no such setting")
+                raise InstrumentError(f"'left={text}': this device has no such setting", code="simulator.setting")
             try:
                 command.check(words)
             except RefusalError as refused:
-                raise InstrumentError(f"'left={text}': {self._errors[refused.reason]}") from None
+                raise InstrumentError(
+                    f"'left={text}': {self._errors[refused.reason]}", code="simulator.setting"
+                ) from None
             self._settings[name] = tuple(words)
 
     def _on_data(self, data: bytes) -> None:

@@ -59,7 +59,9 @@ class SimulatedOptoNCDT(ConsoleDevice):
     def _set_up(self, address: Address) -> None:
         self._model_name = address.params.get("model", "ILD2300")
         if self._model_name not in MODELS:
-            raise InstrumentError(f"'model' in '{address.url}': expected {' or '.join(MODELS)}; found another")
+            raise InstrumentError(
+                f"'model' in '{address.url}': expected {' or '.join(MODELS)}; found another", code="simulator.setting"
+            )
         self._model: Model = MODELS[self._model_name]
         newer = address.number("newer", 0) and self._model_name == "ILD1420"
         self._commands = {**self._model.commands, "MEASRATE": NEWER_RATES} if newer else self._model.commands
