@@ -27,11 +27,12 @@ class SpindleDrift(ModelMethod):
         id="spindle_drift",
         summary="Spindle drift with five sensors on a bar, ISO 230-3: beam detection and drift",
         status="simulated_only",
-        version="4",
+        version="5",
         cannot_see=(
             "the rotation about the spindle axis (EC)",
             "errors within one turn of the spindle, which are averaged out",
             "motion of the sensor frame that is not related to its temperature",
+            "noise of the sensors that is as slow as the drift",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)

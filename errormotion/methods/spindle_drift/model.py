@@ -38,6 +38,7 @@ from errormotion.methods.spindle_drift.identification.record import (
     reference_windows,
     run_out_at_rest,
     settling,
+    slow,
     without_spikes,
 )
 from errormotion.methods.spindle_drift.identification.setup import Setup
@@ -212,6 +213,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         No valid reference state, beams that do not determine the axis, or a record without time.
     """
     notes: list[str] = []
+    doubts: list[str] = []
     record = without_spikes(average_record(raw, settings), settings, notes)
     raw = raw.drop_vars("distance").sel(channel=list(CHANNELS))
     averages = record.averages
@@ -249,6 +251,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
             f"{int(coming_up.sum())} means within {settings.spin_up:g} s of a change of the spindle's speed are NaN."
         )
     sigma = np.where(np.isfinite(averages.mean), noise(raw, record, settings, notes), 0.0).T
+    beyond = slow(record, sigma.T, settings, notes, doubts)
     parts, own = (
         (None, None) if warming is None else smoothing_sources(warming.smoothing, warming.noise, time, reference)
     )
@@ -273,7 +276,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
             reference=Block(start=state[-1:], index=np.zeros_like(index), scale=scale, group=REFERENCE),
         ),
         constants=constants,
-        noise=Noise(sd=_noise(sigma, reference, own)),
+        noise=Noise(sd=_noise(sigma, beyond, reference, own)),
     )
     shown = np.where(known[:-1] & ~coming_up, 0.0, np.nan)[:, None]
     result = Result(raw, record, setup, settings, reference, state, point, UNSEEN)
@@ -302,6 +305,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         zero=result.zero,
         raw_hash=record.hash,
         notes=notes,
+        doubts=doubts,
     )
 
 
@@ -321,13 +325,14 @@ def _states(reading: Array, setup: Setup, per_kelvin: Array) -> Array:
     return state
 
 
-def _noise(sigma: Array, reference: NDArray[np.int64], own: Array | None) -> Array:
+def _noise(sigma: Array, beyond: Array, reference: NDArray[np.int64], own: Array | None) -> Array:
     """Return the standard deviations of the readings of all instants, (n, 5), and of the reference state.
 
-    With the standard uncertainty of the temperature of each instant alone, (n,), where it is a reading.
+    The mean of the reference state keeps the noise ``beyond`` (5,), which may be alike in all its instants. With the
+    standard uncertainty of the temperature of each instant alone, (n,), where it is a reading.
     """
     mean = np.sqrt(np.sum(sigma[reference] ** 2, axis=0)) / reference.size
-    every = np.vstack([sigma, mean])
+    every = np.hypot(np.vstack([sigma, mean]), beyond)
     every = np.maximum(every, np.maximum(_LEAST_NOISE * every.max(), _NO_NOISE))
     return every if own is None else np.column_stack([every, np.maximum(np.append(own, 0.0), _NO_NOISE)])
 

@@ -50,3 +50,22 @@ def test_a_wrong_mean_is_left_out_and_named() -> None:
     assert (~known).sum() == 1
     plain = SpindleDrift().identify(simulate(MEASURED, 1)[0], SETTINGS)
     assert errors["EX"].values[known] == pytest.approx(plain["EX"].values[known], abs=1e-9)
+
+
+def test_noise_that_is_alike_at_neighbouring_instants_is_in_the_uncertainty_and_doubted() -> None:
+    found, plain, doubted = [], [], 0
+    for seed in range(12):
+        raw, truth = simulate(MEASURED, seed)
+        rng = np.random.default_rng([seed, 1])
+        e = rng.standard_normal((raw.sizes["time"], raw.sizes["channel"]))
+        for k in range(1, len(e)):
+            e[k] = 0.8 * e[k - 1] + 0.6 * e[k]
+        plain.append(held(raw, truth)[0])
+        raw["distance"] = raw["distance"] + xr.DataArray(2 * NOISE * e, dims=("time", "channel"))
+        share, errors = held(raw, truth)
+        found.append(share)
+        doubted += any("vary about smooth curves by more than their noise" in each for each in errors.em.doubts)
+    # shares of 95 % with a standard deviation of about 10 % of one data set
+    assert np.mean(found) > 0.85
+    assert np.mean(plain) > 0.85
+    assert doubted >= 9

@@ -22,6 +22,7 @@ from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
 from errormotion.estimation.checks.resolution import common, noise_before, step_of
 from errormotion.estimation.checks.series import spikes
+from errormotion.estimation.checks.slow_noise import slow_noise
 from errormotion.methods.spindle_drift.identification.averaging import (
     Averager,
     Averages,
@@ -345,6 +346,45 @@ def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str])
     return _rounded(np.asarray(sigma * record.weight), record, notes)
 
 
+def slow(record: Record, sigma: Array, settings: Settings, notes: list[str], doubts: list[str]) -> Array:
+    """Return the standard deviation (5,) of the noise of the means beyond ``sigma`` (5, instant), m, if there is any.
+
+    It is alike from mean to mean, or the readings are too few for their second differences.
+    """
+    averages = record.averages
+    if settings.noise == "stated":
+        return np.zeros(len(CHANNELS))
+    values = np.where(settling(record, settings.spin_up), np.nan, averages.mean)
+    found = slow_noise(averages.time, values, sigma, _abrupt(record, settings))
+    if found is None:
+        return np.zeros(len(CHANNELS))
+    sizes = ", ".join(f"{name} {sd * 1e6:.2g} um" for name, sd in zip(CHANNELS, found.sd, strict=True) if sd > 0)
+    if found.duration > 0:
+        doubts.append(
+            f"The readings vary about smooth curves by more than their noise ({sizes}), alike for about "
+            f"{found.duration:.2g} s. The uncertainty of each error contains it, that of a mean or a slope over "
+            "several instants does not. A motion of the spindle that is as fast looks the same."
+        )
+    else:
+        notes.append(
+            f"The readings scatter about smooth curves by more than their noise ({sizes}); the uncertainty contains it."
+        )
+    return found.sd
+
+
+def _abrupt(record: Record, settings: Settings) -> list[float]:
+    """Return the times at which the readings may change abruptly: changes of the speed, and switched compensations.
+
+    The last single reading before a change is the start of the curve that follows. A mean at rest contains the run-out.
+    """
+    time = record.averages.time
+    found = [event.at for event in settings.schedule if event.compensation]
+    if record.spindle_speed is not None:
+        single = record.averages.expected[0] <= 1
+        found += [float(time[max(k - 1, 0) if single else k]) for k in _changes(record.spindle_speed)]
+    return found
+
+
 def _rounded(sigma: Array, record: Record, notes: list[str]) -> Array:
     """Return the uncertainties of means with that of rounding, which all readings of a mean may have in common."""
     found, noted = sigma.copy(), []
@@ -403,11 +443,16 @@ def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
     found = np.zeros(time.size, bool)
     if speed is None or time.size < 2 or record.averages.expected[0] <= 1 or spin_up == 0 or np.ptp(time) <= spin_up:
         return found
-    steady = held(speed)
     length = float(np.median(np.diff(time)))
-    for k in np.flatnonzero(np.abs(np.diff(steady, prepend=0.0)) > _SAME_SPEED * np.abs(steady).max()):
+    for k in _changes(speed):
         found |= (time > time[k] - 0.6 * length) & (time < time[k] + spin_up - 1e-6)
     return found
+
+
+def _changes(speed: Array) -> NDArray[np.intp]:
+    """Return the means with which another speed starts; the spindle is at rest before the record."""
+    steady = held(speed)
+    return np.flatnonzero(np.abs(np.diff(steady, prepend=0.0)) > _SAME_SPEED * np.abs(steady).max())
 
 
 def run_out_at_rest(
