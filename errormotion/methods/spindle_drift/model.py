@@ -37,6 +37,7 @@ from errormotion.methods.spindle_drift.identification.record import (
     noise,
     reference_windows,
     run_out_at_rest,
+    run_out_left,
     settling,
     slow,
     without_spikes,
@@ -251,6 +252,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
             f"{int(coming_up.sum())} means within {settings.spin_up:g} s of a change of the spindle's speed are NaN."
         )
     sigma = np.where(np.isfinite(averages.mean), noise(raw, record, settings, notes), 0.0).T
+    sigma = np.hypot(sigma, run_out_left(record, float(raw["distance_noise"]), settings, notes, doubts))
     beyond = slow(record, sigma.T, settings, notes, doubts)
     parts, own = (
         (None, None) if warming is None else smoothing_sources(warming.smoothing, warming.noise, time, reference)

@@ -6,7 +6,8 @@ import xarray as xr
 
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.spindle_drift import Settings, SpindleDrift
-from errormotion.methods.spindle_drift.simulation import simulate
+from errormotion.methods.spindle_drift.simulation import raw_drift, simulate
+from errormotion.twin import Event, VirtualMachine
 
 SETTINGS = Settings(functional_point=(0.0, 0.0, 0.0))
 MEASURED = Settings(duration=6000.0)
@@ -69,3 +70,30 @@ def test_noise_that_is_alike_at_neighbouring_instants_is_in_the_uncertainty_and_
     assert np.mean(found) > 0.85
     assert np.mean(plain) > 0.85
     assert doubted >= 9
+
+
+def sampled(speed: float, rate: float, seed: int = 1) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return three minutes of single readings of a turning spindle with a run-out of 5 um, and the true errors."""
+    machine = VirtualMachine("cframe", seed=seed)
+    machine.start([Event(0.0, speed)])
+    time = np.arange(0.0, 180.0, 1 / rate)
+    raw = raw_drift(machine, time, seed=seed, averaged=1, warm_up=False, radius_error=False)
+    angle = 2 * np.pi * speed / 60 * time
+    phase = {"X1": 0.0, "X2": 0.3, "Y1": np.pi / 2, "Y2": np.pi / 2 + 0.3, "Z": 1.0}
+    for k, name in enumerate(raw["channel"].values):
+        raw["distance"][k] += 5e-6 * np.cos(angle - phase[str(name)])
+    return raw, machine.truth_spindle(time[:: round(rate / 2)], (0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("speed", "hidden"), [(3001.0, True), (3000.0, True), (1500.0, True), (3240.0, False)])
+def test_run_out_that_sampling_makes_slow_is_doubted(speed: float, hidden: bool) -> None:
+    raw, _ = sampled(speed, 50.0)
+    doubts = SpindleDrift().identify(raw, SETTINGS).em.doubts
+    assert any("samples per second, a mean over 0.5 s contains" in each for each in doubts) == hidden
+
+
+def test_run_out_of_parts_of_turns_is_in_the_uncertainty() -> None:
+    raw, truth = sampled(180.0, 200.0)  # one and a half turns in a mean
+    share, errors = held(raw, truth)
+    assert any("a mean over 0.5 s contains 21% of the run-out" in each for each in errors.em.notes)
+    assert share > 0.9

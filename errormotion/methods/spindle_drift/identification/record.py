@@ -20,6 +20,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.files.hashing import DatasetHasher, cores
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.aliases import aliases
 from errormotion.estimation.checks.resolution import common, noise_before, step_of
 from errormotion.estimation.checks.series import spikes
 from errormotion.estimation.checks.slow_noise import slow_noise
@@ -370,6 +371,43 @@ def slow(record: Record, sigma: Array, settings: Settings, notes: list[str], dou
             f"The readings scatter about smooth curves by more than their noise ({sizes}); the uncertainty contains it."
         )
     return found.sd
+
+
+def run_out_left(record: Record, stated: float, settings: Settings, notes: list[str], doubts: list[str]) -> Array:
+    """Return the standard deviation (5,) of the run-out that a mean contains while the spindle turns, m.
+
+    A mean over many turns contains none of it, unless samples are taken at nearly the same angles of each turn, or the
+    mean is over few turns. Where the wave of the samples is shorter than a mean, its size is that of their scatter.
+    Where it is longer, it is hidden in the means, and unknown.
+    """
+    averages, speed = record.averages, record.spindle_speed
+    count = int(np.median(averages.expected))
+    found = np.zeros(len(CHANNELS))
+    if speed is None or count <= 1:
+        return found
+    rate, turning, said = count / settings.average, turns(speed), set[int]()
+    for part in np.split(np.arange(speed.size), _changes(speed)):
+        usual = float(np.median(np.abs(held(speed)[part]))) if part.size else 0.0
+        if not part.size or not turning[part].any() or round(usual) in said:
+            continue
+        said.add(round(usual))
+        for each in aliases(usual / 60.0, rate, count):
+            what = (
+                f"At {usual:.0f} 1/min and {rate:.4g} samples per second, a mean over {settings.average:g} s contains"
+            )
+            order = f"the run-out (harmonic {each.order})"
+            if each.frequency * settings.average < 1.0:
+                period = f"a wave with a period of about {1 / each.frequency:.2g} s" if each.frequency else "an offset"
+                doubts.append(
+                    f"{what} {each.share:.0%} of {order} as {period}, which the uncertainty does not contain. "
+                    "Choose another spindle speed, sample rate or average."
+                )
+            elif record.scatter is not None:
+                size = each.share * np.sqrt(np.maximum(record.scatter**2 - stated**2, 0.0))
+                if (size > stated / np.sqrt(count)).any():
+                    notes.append(f"{what} {each.share:.0%} of {order}; the uncertainty contains it.")
+                    found = np.maximum(found, size)
+    return found
 
 
 def _abrupt(record: Record, settings: Settings) -> list[float]:
