@@ -14,7 +14,7 @@ from errormotion.datasets import build_deviations, build_errors, plausibility, p
 from errormotion.datasets.raw import variant_of
 from errormotion.datasets.timing import start_of
 from errormotion.errors import FitError, MethodError
-from errormotion.estimation.checks import exclusions
+from errormotion.estimation.checks import exclusions, resolution
 from errormotion.estimation.checks.candidates import Candidate
 from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import Cleaned, cleaned
@@ -34,7 +34,6 @@ from errormotion.measurement.noise import (
     scaled,
     scatter_of,
     searchable,
-    sentence_on,
     size_of_noise,
     steps_of,
 )
@@ -82,7 +81,9 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
         base = observed.problem if final is found else scaled(observed.problem, scatter.factor)
         rounding = rounding_of(observed, base, scatter.factor if final is found else 1.0)
         if rounding is not None:
-            observed = replace(observed, notes=[*observed.notes, sentence_on(observed, rounding)])
+            observed = replace(
+                observed, notes=[*observed.notes, resolution.sentence(observed.what, rounding, observed.unit)]
+            )
             base, factor = scaled(base, factor, rounding.sd), 1.0
             final = fitted(observed, base, final)
         observed = replace(observed, doubts=[*observed.doubts, size_of_noise(observed, base, factor)])

@@ -37,7 +37,6 @@ __all__ = [
     "scaled",
     "scatter_of",
     "searchable",
-    "sentence_on",
     "size_of_noise",
     "steps_of",
 ]
@@ -212,19 +211,6 @@ def rounding_of(observed: Observed, problem: Problem, factor: float) -> Rounding
             code="readings.noise.unknown",
         )
     return found
-
-
-def sentence_on(observed: Observed, rounding: Rounding) -> str:
-    """Return the sentence on rounded readings."""
-    size = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(observed.unit, (1.0, observed.unit))
-
-    def words(value: float) -> str:
-        return f"{value * size[0]:.3g} {size[1]}"
-
-    return (
-        f"{observed.what[:1].upper()}{observed.what[1:]} are multiples of {words(rounding.step)}, with a noise of "
-        f"{words(rounding.noise)} before rounding: rounding is a part of the uncertainties."
-    )
 
 
 def size_of_noise(observed: Observed, problem: Problem, factor: float) -> str:

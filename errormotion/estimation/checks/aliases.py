@@ -1,7 +1,7 @@
 """Periodic parts of readings that sampling turns into slow ones: the run-out of a spindle, its harmonics, the mains.
 
-A wave of the frequency f, sampled at the rate r, has the same samples as one of the frequency |f - r n|, n = f / r rounded.
-A mean over m samples leaves the share
+A wave of the frequency f, sampled at the rate r, has the same samples as one of the frequency |f - r n|, n = f / r
+rounded. A mean over m samples leaves the share
 
     |sin(pi m f / r) / (m sin(pi f / r))|
 

@@ -29,7 +29,7 @@ from errormotion.estimation.blocks import Index
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.problem import Problem
 
-__all__ = ["Rounding", "alike", "common", "noise_before", "rounding", "step_of"]
+__all__ = ["Rounding", "alike", "common", "noise_before", "rounding", "rounding_of_means", "sentence", "step_of"]
 
 _TERMS = np.arange(1, 60)
 _CLOSE = 1e-3
@@ -147,6 +147,32 @@ def rounding(problem: Problem, sd: Array, steps: float | Array | None = None) ->
         return None
     worst = int(np.argmax(steps))
     return Rounding(float(steps[worst]), added, float(before[worst]))
+
+
+def rounding_of_means(sd: Array, count: Array, step: float) -> Rounding | None:
+    """Return what rounding of their readings adds to the noise of means, (n,); None as in `rounding`.
+
+    Parameters
+    ----------
+    sd, count : ndarray, (n,)
+        Standard deviations of the means, and numbers of their readings, which may all be rounded alike.
+    step : float
+        Of the scale of the readings; 0 for none.
+    """
+    if not step > 0:
+        return None
+    noise = noise_before(step, float(np.median(sd * np.sqrt(np.maximum(count, 1)))))
+    b = float(common(step, noise))
+    return Rounding(step, np.full(sd.shape, b), noise) if b**2 > _NOTICEABLE * float(np.median(sd)) ** 2 else None
+
+
+def sentence(what: str, found: Rounding, unit: str = "m") -> str:
+    """Return the sentence on rounded readings; ``what`` is its subject."""
+    factor, name = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(unit, (1.0, unit))
+    return (
+        f"{what[:1].upper()}{what[1:]} are multiples of {found.step * factor:.3g} {name}, with a noise of "
+        f"{found.noise * factor:.3g} {name} before rounding: rounding is a part of the uncertainties."
+    )
 
 
 def alike(problem: Problem) -> Index:

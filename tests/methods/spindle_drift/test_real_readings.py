@@ -36,7 +36,7 @@ def test_rounded_readings(step: float) -> None:
             raw["distance"] = (raw["distance"] / step).round() * step
         share, errors = held(raw, truth)
         found.append(share)
-        assert any("readings are rounded (X1 by 0.1 um" in note for note in errors.em.notes) == (step > 0)
+        assert any("readings of X1 are multiples of 0.1 um" in note for note in errors.em.notes) == (step > 0)
     assert np.mean(found) > 0.9
 
 

@@ -20,8 +20,9 @@ from errormotion.arrays import Array
 from errormotion.datasets.files.hashing import DatasetHasher, cores
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
+from errormotion.estimation.checks import resolution
 from errormotion.estimation.checks.aliases import aliases
-from errormotion.estimation.checks.resolution import common, noise_before, step_of
+from errormotion.estimation.checks.resolution import step_of
 from errormotion.estimation.checks.series import spikes
 from errormotion.estimation.checks.slow_noise import slow_noise
 from errormotion.methods.spindle_drift.identification.averaging import (
@@ -48,8 +49,6 @@ _EDGE = 0.01
 """Share of a mean by which its edges may be off, because the interval of the samples does not divide its length."""
 _FIRST = 20_000
 """Readings of a channel that show the step of its scale."""
-_NOTICEABLE = 0.14
-"""Rounding in units of the noise of a mean from which it adds 1 %."""
 _SHOWN = 6
 """Times in a note."""
 _ENOUGH = 30
@@ -425,22 +424,12 @@ def _abrupt(record: Record, settings: Settings) -> list[float]:
 
 def _rounded(sigma: Array, record: Record, notes: list[str]) -> Array:
     """Return the uncertainties of means with that of rounding, which all readings of a mean may have in common."""
-    found, noted = sigma.copy(), []
+    found = sigma.copy()
     for i, (channel, step) in enumerate(zip(CHANNELS, record.step, strict=True)):
-        if not step > 0:
-            continue
-        before = noise_before(
-            float(step), float(np.median(sigma[i] * np.sqrt(np.maximum(record.averages.count[i], 1))))
-        )
-        b = float(common(float(step), before))
-        if b > _NOTICEABLE * np.median(sigma[i]):
-            noted.append(f"{channel} by {step * 1e6:.3g} um")
-            found[i] = np.hypot(sigma[i], b)
-    if noted:
-        notes.append(
-            f"The readings are rounded ({', '.join(noted)}), with less noise than that: rounding is a part of the "
-            "uncertainties."
-        )
+        added = resolution.rounding_of_means(sigma[i], record.averages.count[i], float(step))
+        if added is not None:
+            notes.append(resolution.sentence(f"the readings of {channel}", added))
+            found[i] = np.hypot(sigma[i], added.sd)
     return found
 
 
