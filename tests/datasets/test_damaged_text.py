@@ -10,7 +10,7 @@ from text_files import DRIFT, DRIFT_MAP, LOG, MAP, READINGS
 
 from errormotion.datasets.importing import import_log
 from errormotion.datasets.storage.disk import load
-from errormotion.datasets.text.dates import Clock, zone_of
+from errormotion.datasets.tables.dates import Clock, zone_of
 from errormotion.datasets.units import KINDS, convert
 from errormotion.errors import DatasetError
 

@@ -9,7 +9,7 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets.importing import import_log
-from errormotion.datasets.text.dates import Clock, is_date
+from errormotion.datasets.tables.dates import Clock, is_date
 from errormotion.errors import DatasetError
 
 MAP = """schema = "errormotion.raw.monitor/1"

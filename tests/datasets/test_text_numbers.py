@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from errormotion.datasets.text.csv_text import NUMBER
+from errormotion.datasets.tables.numbers import NUMBER
 
 
 @pytest.mark.parametrize("end", ["", ".", "x", ".5x", "e", "e+", ".5e5x"])

@@ -26,7 +26,7 @@ from errormotion.datasets.certificates import ATTRIBUTE, certificates_of
 from errormotion.datasets.clock import CLOCK, JOINS, age, notes
 from errormotion.datasets.files import events
 from errormotion.datasets.importing import _reader as log_reader
-from errormotion.datasets.text.dates import Clock, zone_of
+from errormotion.datasets.tables.dates import Clock, zone_of
 from errormotion.datasets.text.readings_csv import read_csv
 from errormotion.datasets.units import KINDS, convert
 from errormotion.datasets.validation import validate

@@ -10,8 +10,6 @@ from pathlib import Path
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.errors import DatasetError
 
-NUMBER = re.compile(r"[+-]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?")
-"""A decimal number; possessive, so that the time for a long text is proportional to its length."""
 MAX_FILE = 64 << 20
 """Largest size of a file, bytes; its cells need more memory."""
 

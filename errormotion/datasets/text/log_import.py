@@ -16,22 +16,15 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model, nearest
 from errormotion.datasets.schemas import RawSchema, Row, variants
-from errormotion.datasets.text.csv_text import NUMBER, Table
-from errormotion.datasets.text.dates import Clock, is_date
-from errormotion.datasets.text.log_format import Format
+from errormotion.datasets.tables.dates import Clock, is_date
+from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.tables.numbers import NUMBER
+from errormotion.datasets.tables.reading import read_table as read_file
+from errormotion.datasets.tables.table import Place, Table
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
-from errormotion.datasets.text.log_reader import (
-    NOTES,
-    Place,
-    clock_notes,
-    clock_of,
-    columns_of,
-    holes,
-    seconds,
-    top_lines,
-)
-from errormotion.datasets.text.mistakes import Mistakes
+from errormotion.datasets.text.log_reader import NOTES, clock_notes, holes, places_of
 from errormotion.datasets.text.table_reader import (
+    Cells,
     Column,
     Found,
     Names,
@@ -62,20 +55,21 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     for dim in settings.labels:
         if dim not in dims:
             map_mistakes.add(0, f"labels.{dim}: unknown dimension; {nearest(dim, dims)}")
-    found = Found()
+    map_mistakes.raise_any()
+    table, found = read_file(log, settings.format), Found()
     for name, value in settings.values.items():
-        _read_value(name, value, settings, log, names, found, map_mistakes)
+        _read_value(name, value, table, names, found, map_mistakes)
     map_mistakes.raise_any()
     known = {key: column for key, column in columns.items() if column is not None}
     mistakes = Mistakes(log)
-    table, start, notes = _table(settings, mistakes)
-    for part, columns_of_part, keys in _parts(table, known, settings, names, mistakes):
+    cells, start, notes = _cells(table, settings, mistakes)
+    for part, columns_of_part, keys in _parts(cells, known, settings, names, mistakes):
         for text in incomplete(columns_of_part, keys, names):
             mistakes.add(0, text)
         if not mistakes.count:
             read_table(part, columns_of_part, keys, names, found, mistakes)
     mistakes.raise_any()
-    notes += _missing_rows(table, list(settings.labels))
+    notes += _missing_rows(cells, list(settings.labels))
     stated = {"machine": settings.machine, "start": start, NOTES: json.dumps(notes) if notes else ""}
     attrs = {**settings.attributes, **{name: text for name, text in stated.items() if text}}
     return found.dataset({"schema": settings.schema_, **attrs}, names)
@@ -138,19 +132,17 @@ def _quantity(text: str, row: Row, where: str, mistakes: Mistakes) -> float:
     return value - zero
 
 
-def _read_value(
-    name: str, entry: MappedValue, settings: LogMap, log: Path, names: Names, found: Found, mistakes: Mistakes
-) -> None:
+def _read_value(name: str, entry: MappedValue, table: Table, names: Names, found: Found, mistakes: Mistakes) -> None:
     """Read a variable whose value is in the map, or in the first lines of the log after a key that the map states."""
     row, where = names.rows.get(name), f"values.{name}"
     if row is None:
         mistakes.add(0, f"{where}: unknown variable; {nearest(name, names.rows)}")
         return
-    stated = entry.value if not entry.key else _header_text(log, entry.key, settings)
+    stated = entry.value if not entry.key else _header_text(table, entry.key)
     if stated is None:
-        mistakes.add(0, f"{where}: no line with '{entry.key}' and a value at the top of {log.name}")
+        mistakes.add(0, f"{where}: no line with '{entry.key}' and a value at the top of {table.path.name}")
         return
-    where += f", '{entry.key}' in {log.name}" if entry.key else ""
+    where += f", '{entry.key}' in {table.path.name}" if entry.key else ""
     parsed = _numbers(stated, entry.unit)
     if parsed is None or parsed[0].ndim != len(row.dims):
         kind = f"an array with the dims ({', '.join(row.dims)})" if row.dims else "one number"
@@ -191,71 +183,48 @@ def _numbers(stated: Any, unit: str) -> tuple[Array, str] | None:
     return (values, units.pop()) if len(units) == 1 and values.size and np.isfinite(values).all() else None
 
 
-def _header_text(log: Path, key: str, settings: LogMap) -> str | None:
-    """Return the text after a key in the first lines of a log."""
-    for line in top_lines(log, settings.format):
+def _header_text(table: Table, key: str) -> str | None:
+    """Return the text after a key in the lines above a table."""
+    for line in table.above:
         match = re.fullmatch(rf"\W*{re.escape(key)}\"?\s*[:=;,\t ]\s*(.+)", line.strip())
         if match:
             text = match[1].strip('";, \t')
-            return text.replace(",", ".") if settings.format.decimal == "," else text
+            return text.replace(",", ".") if table.form.decimal == "," else text
     return None
 
 
-def _table(settings: LogMap, mistakes: Mistakes) -> tuple[Table, str, list[str]]:
-    """Return the required columns of a log as a table with points as decimal signs, its first date, and notes."""
-    form = settings.format
+def _cells(table: Table, settings: LogMap, mistakes: Mistakes) -> tuple[Cells, str, list[str]]:
+    """Return the required columns of a table with numbers and labels, its first date, and notes."""
     wanted: dict[str, Place] = {f"labels.{dim}": column for dim, column in settings.labels.items()}
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
+    places = places_of(table, wanted, mistakes)
+    names = {key: f"column '{table.titles[where[0]]}'" for key, where in places.items()}
     dated = {f"columns.{key}": entry.unit for key, entry in settings.columns.items() if is_date(entry.unit)}
-    clocks = {key: clock_of(form, unit, repeats=True) for key, unit in dated.items()}
-    (line, titles), lines, places = columns_of(wanted, form, mistakes)
-    cells = []
-    for number, row in lines:
-        if len(row) != len(titles):
-            mistakes.add(number, f"expected {len(titles)} fields; found {len(row)}")
-            continue
-        texts = []
-        for key, place in places.items():
-            text = " ".join(row[each].strip() for each in place)
-            if text in form.missing:
-                text = ""
-            elif key in clocks and text:
-                text = repr(seconds(text, clocks[key], f"column '{titles[place[0]]}'", number, mistakes))
-            elif key.startswith("columns"):
-                text = _plain(text, f"column '{titles[place[0]]}'", form, number, mistakes)
-            texts.append(text)
-        cells.append((number, texts))
-    heads = [titles[place[0]] if form.header else str(place[0] + 1) for place in places.values()]
+    numeric = {where[0]: names[key] for key, where in places.items() if key.startswith("columns") and key not in dated}
+    values = table.numbers(numeric, mistakes)
+    clocks: dict[str, Clock] = {}
+    numbers: dict[int, Array] = {}
+    for k, (key, where) in enumerate(places.items()):
+        if key in dated:
+            numbers[k], clocks[key] = table.seconds(where, dated[key], names[key], mistakes, repeats=True)
+        elif where[0] in values:
+            numbers[k] = values[where[0]]
+    texts = {k: table.texts(where) for k, (key, where) in enumerate(places.items()) if key.startswith("labels")}
     start = next((clock.start.isoformat() for clock in clocks.values() if clock.start), "")
-    notes = [note for clock in clocks.values() for note in clock_notes(clock)]
+    notes = [*table.notes, *(note for clock in clocks.values() for note in clock_notes(clock))]
     time = next((k for k, key in enumerate(places) if key == "columns.time"), None)
     if time is not None and not mistakes.count:
-        notes += _holes(cells, time, clocks.get("columns.time"), settings)
-    return Table((line, heads), cells), start, notes
+        unit = "s" if "columns.time" in clocks else settings.columns["time"].unit
+        notes += holes(np.asarray(convert(numbers[time], unit, "s"), dtype=float), table.lines)
+    heads = [table.titles[where[0]] for where in places.values()]
+    return Cells((table.head, heads), table.lines, texts, numbers), start, notes
 
 
-def _plain(text: str, place: str, form: Format, line: int, mistakes: Mistakes) -> str:
-    try:
-        return form.plain(text)
-    except ValueError as error:
-        mistakes.add(line, f"{place}: {error}", f"{place}: thousands")
-        return text
-
-
-def _holes(cells: list[tuple[int, list[str]]], place: int, clock: Clock | None, settings: LogMap) -> list[str]:
-    """Return the notes on missing rows of a log with times."""
-    known = [(line, float(texts[place])) for line, texts in cells if NUMBER.fullmatch(texts[place])]
-    lines, times = np.array([line for line, _ in known]), np.array([time for _, time in known])
-    unit = "s" if clock else settings.columns["time"].unit
-    return holes(np.asarray(convert(times, unit, "s"), dtype=float), lines)
-
-
-def _missing_rows(table: Table, dims: list[str]) -> list[str]:
+def _missing_rows(table: Cells, dims: list[str]) -> list[str]:
     """Return the note on combinations of labels for which the log has no row."""
-    rows = [texts[: len(dims)] for _, texts in table.rows]
-    labels = [list(dict.fromkeys(column)) for column in zip(*rows, strict=True)]
-    there = {tuple(row) for row in rows}
-    lacking = math.prod(map(len, labels)) - len(there)
+    labels = [list(dict.fromkeys(table.texts[k])) for k in range(len(dims))]
+    there = set(zip(*(table.texts[k] for k in range(len(dims))), strict=True))
+    lacking = math.prod(map(len, labels)) - len(there) if dims else 0
     if not lacking:
         return []
     first = next(each for each in itertools.product(*labels) if each not in there)
@@ -265,8 +234,8 @@ def _missing_rows(table: Table, dims: list[str]) -> list[str]:
 
 
 def _parts(
-    table: Table, columns: Mapping[str, Column], settings: LogMap, names: Names, mistakes: Mistakes
-) -> Iterator[tuple[Table, dict[int, Column], dict[str, int]]]:
+    table: Cells, columns: Mapping[str, Column], settings: LogMap, names: Names, mistakes: Mistakes
+) -> Iterator[tuple[Cells, dict[int, Column], dict[str, int]]]:
     """Yield the table once for each set of dimensions, with the columns of its variables and the label columns.
 
     Variables with fewer dimensions than others have repeated values; one line of each is kept.
@@ -287,18 +256,22 @@ def _parts(
         mistakes.add(0, f"labels.{dim}: no variable of the map has this dimension")
 
 
-def _without_repetition(table: Table, keys: Sequence[int], values: Sequence[int], mistakes: Mistakes) -> Table:
+def _without_repetition(table: Cells, keys: Sequence[int], values: Sequence[int], mistakes: Mistakes) -> Cells:
     """Return the first line for each combination of labels; other values in a later line are mistakes."""
-    kept: dict[tuple[str, ...], tuple[int, list[str]]] = {}
-    for line, texts in table.rows:
-        before = kept.setdefault(tuple(texts[number] for number in keys), (line, texts))
-        for number in values:
-            if texts[number] != before[1][number]:
-                title = table.head[1][number]
-                mistakes.add(
-                    line,
-                    f"column '{title}': expected {before[1][number] or 'nothing'} as in line {before[0]}, which has "
-                    f"the same labels; found {texts[number] or 'nothing'}",
-                    f"column '{title}': other values with the same labels",
-                )
-    return Table(table.head, list(kept.values()))
+    first: dict[tuple[str, ...], int] = {}
+    labels = zip(*(table.texts[number] for number in keys), strict=True)
+    before = np.array([first.setdefault(label, k) for k, label in enumerate(labels)], dtype=np.int64)
+    for number in values:
+        column = table.numbers[number]
+        for k in np.flatnonzero((column != column[before]) & ~(np.isnan(column) & np.isnan(column[before]))):
+            title, at = table.head[1][number], before[k]
+            expected, found = ("nothing" if np.isnan(x) else f"{x:.9g}" for x in (column[at], column[k]))
+            mistakes.add(
+                int(table.lines[k]),
+                f"column '{title}': expected {expected} as in line {table.lines[at]}, which has "
+                f"the same labels; found {found}",
+                f"column '{title}': other values with the same labels",
+            )
+    kept = np.array(list(first.values()), dtype=np.int64)
+    texts = {k: [column[at] for at in kept] for k, column in table.texts.items()}
+    return Cells(table.head, table.lines[kept], texts, {k: column[kept] for k, column in table.numbers.items()})

@@ -6,8 +6,8 @@ from typing import Any, Self
 
 from pydantic import Field, model_validator
 
-from errormotion.datasets.text.dates import is_date
-from errormotion.datasets.text.log_format import Column, Format, LogTable, TimeColumn
+from errormotion.datasets.tables.dates import is_date
+from errormotion.datasets.tables.format import Column, Format, LogTable, TimeColumn
 
 
 class MappedColumn(LogTable):

@@ -20,6 +20,7 @@ another table, with its own names.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +28,11 @@ import xarray as xr
 
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.schemas import Row, raw_schemas, variants
-from errormotion.datasets.text.csv_text import NUMBER, Table, blocks
-from errormotion.datasets.text.mistakes import Mistakes
+from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.tables.numbers import NUMBER
+from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.text.table_reader import (
+    Cells,
     Column,
     Found,
     Names,
@@ -46,6 +49,7 @@ from errormotion.errors import DatasetError
 TEXTS = ("schema", "machine", "sensor", "source", "title", "start")
 """Keys of the header that are stored as attributes."""
 
+_EMPTY = ("", "NaN", "nan")
 _COLUMN = re.compile(r"([^\W\d]\w*)\s*(?:\[([^\]]*)\])?")
 
 
@@ -94,7 +98,7 @@ def read_csv(path: str | Path) -> xr.Dataset:
         before = mistakes.count
         columns, keys = _columns(table, names, found, mistakes)
         if mistakes.count == before and columns:
-            read_table(table, columns, keys, names, found, mistakes)
+            read_table(_cells(table, columns, keys, mistakes), columns, keys, names, found, mistakes)
     mistakes.raise_any()
     attrs = {key: text for key, (_, text) in header.items() if key in TEXTS}
     raw = found.dataset(attrs, names)
@@ -129,6 +133,32 @@ def _value(key: str, line: int, text: str, names: Names, found: Found, mistakes:
     if inside is not None and plausible(inside, np.full(len(inside), line), row, key, unit, mistakes):
         values = unit_vectors(inside, row, np.array([line]), mistakes) if row.dims else inside[0]
         found.variables[key] = xr.Variable(row.dims, values, units_of(row))
+
+
+def _cells(table: Table, columns: Mapping[int, Column], keys: Mapping[str, int], mistakes: Mistakes) -> Cells:
+    """Return labels and numbers of a table; every other cell is a mistake."""
+    titles, rows = table.head[1], []
+    for line, texts in table.rows:
+        if len(texts) == len(titles):
+            rows.append((line, texts))
+            continue
+        comma = " (the decimal sign is a point)" if len(texts) > len(titles) else ""
+        mistakes.add(line, f"expected {len(titles)} fields; found {len(texts)}{comma}")
+    numbers = {place: np.full(len(rows), np.nan) for place in columns}
+    for k, (line, texts) in enumerate(rows):
+        for place, column in columns.items():
+            text, title = texts[place], f"column '{titles[place]}'"
+            if text in _EMPTY and column.may_be_empty:
+                continue
+            if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
+                comma = " (the decimal sign is a point)" if "," in text else ""
+                shown = f"'{text}'" if text else "nothing"
+                mistakes.add(line, f"{title}: expected a number; found {shown}{comma}")
+                numbers[place][k] = 0.0  # reported; nothing is read from this table
+                continue
+            numbers[place][k] = float(text)
+    labels = {place: [texts[place] for _, texts in rows] for place in keys.values()}
+    return Cells(table.head, np.array([line for line, _ in rows], dtype=np.int64), labels, numbers)
 
 
 def _in(row: Row) -> str:

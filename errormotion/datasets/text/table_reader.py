@@ -13,12 +13,31 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.datasets.schemas import RawSchema, Row
-from errormotion.datasets.text.csv_text import NUMBER, Table
-from errormotion.datasets.text.mistakes import Mistakes
+from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
-_EMPTY = ("", "NaN", "nan")
+
+@dataclass(frozen=True)
+class Cells:
+    """Columns of a table.
+
+    Attributes
+    ----------
+    head : (int, list of str)
+        Line and names of the columns.
+    lines : ndarray, (n,)
+        Line of each row.
+    texts : mapping of int to sequence of str
+        Cells of the columns with labels of a dimension, (n,) each.
+    numbers : mapping of int to ndarray
+        Cells of the columns with values, (n,) each; NaN for empty ones.
+    """
+
+    head: tuple[int, list[str]]
+    lines: NDArray[np.int64]
+    texts: Mapping[int, Sequence[str]]
+    numbers: Mapping[int, Array]
 
 
 @dataclass(frozen=True)
@@ -176,7 +195,7 @@ def unit_vectors(values: Array, row: Row, lines: NDArray[np.int64], mistakes: Mi
 
 
 def read_table(
-    table: Table,
+    table: Cells,
     columns: Mapping[int, Column],
     keys: Mapping[str, int],
     names: Names,
@@ -187,8 +206,8 @@ def read_table(
 
     Parameters
     ----------
-    table : Table
-        Column titles and cells.
+    table : Cells
+        Columns with labels and values.
     columns : mapping of int to Column
         Variables by the number of their column, from 0.
     keys : mapping of str to int
@@ -203,16 +222,16 @@ def read_table(
     line, titles = table.head
     before = mistakes.count
     record = names.record_dims(next(iter(columns.values())).row)
-    cells = _cells(table, columns, titles, mistakes)
+    lines = table.lines
+    _require_rows(table, columns, mistakes)
     places = _places(table, record, keys, names, found, mistakes)
     if mistakes.count > before:
         return
-    lines = np.array([number for number, _ in table.rows])
     shape = tuple(found.sizes[dim][0] for dim in record)
     arrays: dict[str, Array] = {}
     for number, column in columns.items():
         row, component, title = column.row, column.component, f"column '{titles[number]}'"
-        inside = converted(cells[number], column.unit, row, title, line, mistakes)
+        inside = converted(table.numbers[number], column.unit, row, title, line, mistakes)
         if inside is None:
             continue
         with np.errstate(over="ignore"):  # infinite values are refused as implausible
@@ -266,31 +285,19 @@ def incomplete(columns: Mapping[int, Column], keys: Mapping[str, int], names: Na
     yield from (f"column '{dim}': no variable of this table has this dimension" for dim in keys if dim not in record)
 
 
-def _cells(table: Table, columns: Mapping[int, Column], titles: list[str], mistakes: Mistakes) -> dict[int, Array]:
-    """Return the numbers of each column; every other cell is a mistake."""
-    if not table.rows:
+def _require_rows(table: Cells, columns: Mapping[int, Column], mistakes: Mistakes) -> None:
+    """Report a table without rows, and empty cells where there must be a number."""
+    if not table.lines.size:
         mistakes.add(table.head[0], "expected lines of numbers below the column names; found none")
-    found = {place: np.full(len(table.rows), np.nan) for place in columns}
-    for k, (line, texts) in enumerate(table.rows):
-        if len(texts) != len(titles):
-            comma = " (the decimal sign is a point)" if len(texts) > len(titles) else ""
-            mistakes.add(line, f"expected {len(titles)} fields; found {len(texts)}{comma}")
-            continue
-        for place, column in columns.items():
-            text, title = texts[place], f"column '{titles[place]}'"
-            if text in _EMPTY and column.may_be_empty:
-                continue
-            if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
-                comma = " (the decimal sign is a point)" if "," in text else ""
-                shown = f"'{text}'" if text else "nothing"
-                mistakes.add(line, f"{title}: expected a number; found {shown}{comma}")
-                continue
-            found[place][k] = float(text)
-    return found
+    for number, column in columns.items():
+        if not column.may_be_empty:
+            for k in np.flatnonzero(np.isnan(table.numbers[number])):
+                title = f"column '{table.head[1][number]}'"
+                mistakes.add(int(table.lines[k]), f"{title}: expected a number; found nothing")
 
 
 def _places(
-    table: Table,
+    table: Cells,
     record: tuple[str, ...],
     keys: Mapping[str, int],
     names: Names,
@@ -298,40 +305,61 @@ def _places(
     mistakes: Mistakes,
 ) -> tuple[NDArray[np.int64], ...]:
     """Return the index of each line along each dimension of the table."""
-    places = np.zeros((len(record), len(table.rows)), dtype=int)
-    counts: dict[tuple[int, ...], int] = {}
-    seen: dict[tuple[int, ...], int] = {}
+    n = len(table.lines)
+    places: list[NDArray[np.int64]] = []
+    leading = np.zeros(n, dtype=np.int64)  # one number for each combination of the indices so far
     settled = set(found.labels)
-    for k, (line, texts) in enumerate(table.rows):
-        if len(texts) != len(table.head[1]):
-            continue  # reported already
-        for axis, dim in enumerate(record):
-            if dim in keys:
-                places[axis, k] = _label(texts[keys[dim]], dim, dim in settled, line, names, found, mistakes)
-            else:
-                leading = tuple(places[:axis, k])
-                places[axis, k] = counts[leading] = counts.get(leading, -1) + 1
-        place = tuple(places[:, k])
-        if place in seen:
-            label = ", ".join(f"{dim} '{texts[keys[dim]]}'" for dim in record)
-            mistakes.add(line, f"{label}: duplicate; first given in line {seen[place]}", "duplicate")
-        seen.setdefault(place, line)
-    for axis, dim in enumerate(record):
-        size = len(found.labels.get(dim, ())) if dim in keys else int(places[axis].max(initial=-1)) + 1
+    for dim in record:
+        if dim in keys:
+            at = _labels(table.texts[keys[dim]], dim, dim in settled, table.lines, names, found, mistakes)
+        else:
+            at = _counted(leading)
+        places.append(at)
+        leading = np.unique(leading * (int(at.max(initial=0)) + 1) + at, return_inverse=True)[1].reshape(n)
+    _, first, inverse = np.unique(leading, return_index=True, return_inverse=True)
+    for k in np.flatnonzero(first[inverse] != np.arange(n)):
+        label = ", ".join(f"{dim} '{table.texts[keys[dim]][k]}'" for dim in record)
+        before = int(table.lines[first[inverse[k]]])
+        mistakes.add(int(table.lines[k]), f"{label}: duplicate; first given in line {before}", "duplicate")
+    for dim, at in zip(record, places, strict=True):
+        size = len(found.labels.get(dim, ())) if dim in keys else int(at.max(initial=-1)) + 1
         known, where = found.sizes.setdefault(dim, (size, table.head[0]))
         if size != known:
             mistakes.add(table.head[0], f"expected {known} along {dim}, as in the table of line {where}; found {size}")
     return tuple(places)
 
 
-def _label(text: str, dim: str, settled: bool, line: int, names: Names, found: Found, mistakes: Mistakes) -> int:
-    """Return the index of a label along its dimension; a new one is added unless another table states all labels."""
+def _counted(leading: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many lines with the same indices are above each line."""
+    order = np.argsort(leading, kind="stable")
+    grouped = leading[order]
+    starts = np.flatnonzero(np.diff(grouped, prepend=grouped[:1] - 1))
+    lengths = np.diff(starts, append=len(grouped))
+    at = np.empty(len(leading), dtype=np.int64)
+    at[order] = np.arange(len(leading)) - np.repeat(starts, lengths)
+    return at
+
+
+def _labels(
+    texts: Sequence[str],
+    dim: str,
+    settled: bool,
+    lines: NDArray[np.int64],
+    names: Names,
+    found: Found,
+    mistakes: Mistakes,
+) -> NDArray[np.int64]:
+    """Return the index of each label along its dimension; new ones are added unless another table states all labels."""
     labels = found.labels.setdefault(dim, list(names.labels.get(dim, ())))
-    if text in labels:
-        return labels.index(text)
-    if not text:
-        mistakes.add(line, f"column '{dim}': expected a number or name; found nothing")
-    elif settled or dim in names.labels:
-        mistakes.add(line, f"column '{dim}': expected one of {', '.join(labels)}; found '{text}'")
-    labels.append(text)
-    return len(labels) - 1
+    known = {label: k for k, label in enumerate(labels)}
+    expected = list(labels)
+    for line, text in zip(lines, texts, strict=True):
+        if text in known:
+            continue
+        if not text:
+            mistakes.add(int(line), f"column '{dim}': expected a number or name; found nothing")
+        elif settled or dim in names.labels:
+            mistakes.add(int(line), f"column '{dim}': expected one of {', '.join(expected)}; found '{text}'")
+        known[text] = len(labels)
+        labels.append(text)
+    return np.array([known[text] for text in texts], dtype=np.int64)

@@ -21,8 +21,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from errormotion.datasets.text.csv_text import NUMBER, Table, blocks
-from errormotion.datasets.text.mistakes import Mistakes
+from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.tables.numbers import NUMBER
+from errormotion.datasets.text.csv_text import Table, blocks
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 

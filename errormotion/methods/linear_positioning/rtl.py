@@ -22,7 +22,7 @@ from pydantic import AfterValidator, Field
 
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.files.tomlfile import load_model
-from errormotion.datasets.text.mistakes import Mistakes
+from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import iso_names

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from errormotion.datasets.text.dates import TIMESTAMP, is_date
-from errormotion.datasets.text.log_format import Column, Format, LogTable
-from errormotion.datasets.text.log_format import TimeColumn as DateColumns
+from errormotion.datasets.tables.dates import TIMESTAMP, is_date
+from errormotion.datasets.tables.format import Column, Format, LogTable
+from errormotion.datasets.tables.format import TimeColumn as DateColumns
 from errormotion.datasets.units import Angle, Length, convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.schema import CHANNELS

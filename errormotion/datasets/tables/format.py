@@ -1,4 +1,4 @@
-"""Format of a text log: the tables that every map has."""
+"""Format of a table: what is not stated is recognised."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from errormotion.datasets.text.dates import zone_of
+from errormotion.datasets.tables.dates import zone_of
+from errormotion.datasets.tables.numbers import plain_spaces
 
 _POINT_BETWEEN_THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(?:\.[0-9]{3})+(?:,[0-9]*)?")
 
@@ -20,6 +21,8 @@ class LogTable(BaseModel):
 
 
 def _known_encoding(name: str) -> str:
+    if name == "auto":
+        return name
     try:
         return codecs.lookup(name).name
     except LookupError as error:
@@ -41,26 +44,27 @@ TimeColumn = Annotated[
 
 
 class Format(LogTable):
-    """Format of the text."""
+    """Format of a table; ``auto`` and keys without a value are recognised from the file."""
 
-    encoding: Annotated[str, AfterValidator(_known_encoding)] = "utf-8"
-    delimiter: Literal[",", ";", "\t", " ", "auto"] = "auto"
-    decimal: Literal[".", ","] = "."
+    encoding: Annotated[str, AfterValidator(_known_encoding)] = "auto"
+    delimiter: Literal[",", ";", "\t", " ", "|", "auto"] = "auto"
+    decimal: Literal[".", ",", "auto"] = "auto"
     thousands: Literal["", ".", ",", " ", "'"] | None = Field(
-        None, description="separator of groups of three digits; empty: none"
+        None, description="separator of groups of three digits; empty: none; default: recognised"
     )
     zone: Annotated[str, AfterValidator(_known_zone)] = Field(
         "", description="time zone of dates without an offset, such as 'Europe/Berlin'"
     )
     comment: str = "#"
-    header: bool = True
-    skip: int = Field(0, ge=0)
-    missing: tuple[str, ...] = ("NaN", "nan")
+    header: bool | None = Field(None, description="whether a line has the names of the columns; default: recognised")
+    skip: int = Field(0, ge=0, description="number of lines above the header that are not read")
+    missing: tuple[str, ...] = Field(
+        (), description="further texts or numbers that stand for no value, such as '-9999'"
+    )
+    sheet: str = Field("", description="sheet of a spreadsheet, or group of a file with several tables")
 
     @model_validator(mode="after")
     def _signs_differ(self) -> Self:
-        if self.decimal == self.delimiter:
-            raise ValueError("decimal sign and delimiter are both ','; a log with decimal commas has another delimiter")
         if self.thousands and self.thousands in (self.decimal, self.delimiter):
             raise ValueError(
                 f"thousands: '{self.thousands}' is the decimal sign or the delimiter; expected another sign"
@@ -87,7 +91,7 @@ class Format(LogTable):
 
     def _without_thousands(self, text: str) -> str:
         sign = str(self.thousands)
-        plain = re.sub("[\u00a0\u202f]", " ", text) if sign == " " else text.replace("\u2019", "'")
+        plain = plain_spaces(text)
         whole, decimal, rest = plain.partition(self.decimal)
         if sign not in plain:
             return f"{whole}.{rest}" if decimal else plain
