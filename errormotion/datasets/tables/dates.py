@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 
@@ -160,45 +161,24 @@ class Clock:
     def many(self, texts: Sequence[str]) -> Array | None:
         """Return the seconds of many dates since the first one at once, (n,); None where they need `seconds`.
 
-        These are dates with empty or wrong texts, in a zone whose offset changes between them, or of other units.
+        That is the case with empty or wrong texts, of different lengths, with names of months or offsets, and in a zone
+        whose offset changes between the dates.
         """
-        pattern = self._strptime(texts[0]) if len(texts) >= _MANY else None
-        if pattern is None:
+        if len(texts) < _MANY or self.unit == ELAPSED:
             return None
-        import pandas as pd
-
-        try:
-            stamps = pd.to_datetime(pd.Series(texts, dtype=object), format=pattern, exact=True).to_numpy(
-                "datetime64[ns]"
-            )
-        except (ValueError, TypeError):
-            return None
-        if np.isnat(stamps).any():
+        stamps = _fixed(texts, "yyyy-mm-dd" if self.unit == TIMESTAMP else self.unit.lower())
+        if stamps is None:
             return None
         first, last = self._parsed(texts[0]), self._parsed(texts[-1])
         if first.tzinfo is None and self.zone is not None:
-            low, high = (pd.Timestamp(each).to_pydatetime() for each in (stamps.min(), stamps.max()))
-            months = (
-                [low + k * (high - low) / 64 for k in range(65)] if high - low > timedelta(hours=1) else [low, high]
-            )
-            offsets = {each.replace(tzinfo=self.zone, fold=fold).utcoffset() for each in months for fold in (0, 1)}
-            if len(offsets) > 1 or high - low > timedelta(days=365 * 4):
+            low, high = (each.astype("datetime64[us]").astype(datetime) for each in (stamps.min(), stamps.max()))
+            between = [low + k * (high - low) / 64 for k in range(65)]
+            offsets = {each.replace(tzinfo=self.zone, fold=fold).utcoffset() for each in between for fold in (0, 1)}
+            if len(offsets) > 1 or high - low > timedelta(days=4 * 365):  # steps of less than a month
                 return None
             first, last = first.replace(tzinfo=self.zone), last.replace(tzinfo=self.zone)
         self.start, self._last, self._last_text = first, last, texts[-1]
-        return (stamps - stamps[0]) / np.timedelta64(1, "s")
-
-    def _strptime(self, text: str) -> str | None:
-        """Return the pattern of pandas for texts such as this one; None if it is read one by one."""
-        if self.unit == TIMESTAMP:
-            match = re.fullmatch(r"\d{4}-\d\d-\d\d([T ])\d\d:\d\d:\d\d(\.\d+)?", text, re.ASCII)
-            return f"%Y-%m-%d{match[1]}%H:%M:%S{'.%f' if match[2] else ''}" if match else None
-        if self.unit == ELAPSED or self.unit in COUNTED or "mmm" in self.unit or "yyyy" not in self.unit:
-            return None
-        codes = {"dd": "%d", "mm": "%m", "yyyy": "%Y", "yy": "%y"}
-        date = re.sub("dd|mm|yyyy|yy", lambda match: codes[match[0]], self.unit.lower())
-        match = re.search(r"(\s|T)\d\d:\d\d:\d\d(\.\d+)?$", text, re.ASCII)
-        return f"{date}{match[1]}%H:%M:%S{'.%f' if match[2] else ''}" if match else None
+        return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"), dtype=float)
 
     def _elapsed(self, text: str) -> float:
         match = _ELAPSED.fullmatch(text)
@@ -265,6 +245,43 @@ class Clock:
         codes = {"dd": "%d", "mm": "%m", "mmm": "%b", "yyyy": "%Y", "yy": "%y"}
         pattern = re.sub("dd|mmm|mm|yyyy|yy", lambda match: codes[match[0]], self.unit.lower())
         return f"a date and time such as {_EXAMPLE.strftime(f'{pattern} %H:%M:%S')}"
+
+
+def _fixed(texts: Sequence[str], unit: str) -> NDArray[np.datetime64] | None:
+    """Return dates with times of day whose digits all have the same places, (n,); None for others.
+
+    ``unit`` is an order with four digits of the year; the time of day is hh:mm:ss, with up to nine decimals.
+    """
+    match = re.fullmatch(
+        rf"[0-9{re.escape('./-')}]{{10}}[T _-][0-9]{{2}}:[0-9]{{2}}:[0-9]{{2}}(?:[.,:][0-9]{{1,9}})?", texts[0]
+    )
+    if match is None or "yyyy" not in unit or "mmm" in unit:
+        return None
+    length = len(texts[0])
+    if set(map(len, texts)) != {length}:
+        return None
+    signs = np.array(texts, dtype=f"U{length}").view(np.uint32).reshape(len(texts), length).astype(np.int64)
+    template = signs[0]
+    is_digit = (template >= 48) & (template <= 57)
+    digits = signs[:, is_digit] - 48
+    if (signs[:, ~is_digit] != template[~is_digit]).any() or (digits < 0).any() or (digits > 9).any():
+        return None
+
+    def number(begin: int, count: int) -> NDArray[np.int64]:
+        return (signs[:, begin : begin + count] - 48) @ 10 ** np.arange(count - 1, -1, -1)
+
+    year, month, day = (number(unit.index(part), len(part)) for part in ("yyyy", "mm", "dd"))
+    hour, minute, second = number(11, 2), number(14, 2), number(17, 2)
+    if (month < 1).any() or (month > 12).any() or (hour > 23).any() or (minute > 59).any() or (second > 59).any():
+        return None
+    months = (year - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (month - 1)
+    days = months.astype("datetime64[D]") + (day - 1)
+    if (days.astype("datetime64[M]") != months).any() or (day < 1).any():
+        return None
+    decimals = length - 20
+    parts = number(20, decimals) * 10 ** (9 - decimals) if decimals > 0 else 0
+    clock = ((hour * 60 + minute) * 60 + second) * 10**9 + parts
+    return days.astype("datetime64[ns]") + np.asarray(clock).astype("timedelta64[ns]")
 
 
 def _difference(later: datetime, earlier: datetime) -> float:

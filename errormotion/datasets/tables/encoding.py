@@ -98,8 +98,8 @@ def _legacy(data: bytes) -> str:
         from charset_normalizer import from_bytes
 
         lines = b"\n".join(line for line in data[: 16 * _SAMPLE].split(b"\n") if re.search(rb"[\x80-\xff]", line))
-        best = from_bytes(lines[:_SAMPLE], cp_isolation=list(_DOUBLE)).best()
-        if best is not None:
-            return best.encoding
+        matches = list(from_bytes(lines[:_SAMPLE], cp_isolation=list(_DOUBLE)))
+        if matches:
+            return min(matches, key=lambda match: (match.chaos, _DOUBLE.index(match.encoding))).encoding
     shown = {encoding: data[: 16 * _SAMPLE].decode(encoding, errors="replace") for encoding in _SINGLE}
     return max(_SINGLE, key=lambda encoding: len(_EXPECTED.findall(shown[encoding])))

@@ -110,12 +110,21 @@ def delimiter_of(lines: Sequence[str], missing: Sequence[str] = ()) -> str:
                 score *= 1.0 if heads else 0.9
         if score > best + 1e-9:
             best, chosen = score, delimiter
+    if chosen == "," and _one_column(lines, missing):
+        return "|"
     if best <= 0.3 and sum(is_data(line.strip(), missing) for line in lines) >= best * len(lines):
         return "|"  # one column: a sign that occurs in no number
     return chosen
 
 
-def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None) -> Body | None:
+def _one_column(lines: Sequence[str], missing: Sequence[str]) -> bool:
+    """Return whether lines with one comma each are one column of numbers with decimal commas, below a name without."""
+    numbers = [line for line in lines if re.fullmatch(r"\s*[+-]?[0-9]+,[0-9]+\s*", line)]
+    others = [line for line in lines if line not in numbers]
+    return bool(numbers and others) and not any("," in line or is_data(line.strip(), missing) for line in others)
+
+
+def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None, slack: int = 1) -> Body | None:
     """Return the place of the table in lines that are split into fields; None if there are no rows of numbers.
 
     Parameters
@@ -126,6 +135,8 @@ def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None) -
         Texts that stand for no value.
     header : bool, optional
         Whether there is a header, if it is stated.
+    slack : int
+        Number of fields by which the line of names may differ from the rows.
     """
     sample = _spread(rows)
     shares = [(len(row), [is_data(text, missing) for text in row]) for _, row in sample]
@@ -140,13 +151,20 @@ def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None) -
         return widths[size] ** 2 * size * (4 if size in named else 1), size
 
     width = max(widths, key=weight)
-    middle = [row for _, row in sample if len(row) == width]
-    middle = middle[min(len(middle) - 1, max(3, len(middle) // 4)) :]  # without the lines of names and units
+    # The rows are the lines with most numbers; a line of names has none, one of statistics a word in their place.
+    inside = [
+        (sum(kind and text != "" for kind, text in zip(kinds, row, strict=True)), row)
+        for (size, kinds), (_, row) in zip(shares, sample, strict=True)
+        if size == width
+    ]
+    most = max(count for count, _ in inside)
+    middle = [row for count, row in inside if count >= max(1, most - 1)]
     numeric = []
     for k in range(width):
         cells = [row[k] for row in middle]
         filled = [text for text in cells if not no_value(text, missing)]
-        if filled and sum(is_data(text, missing) for text in filled) >= _SHARE * len(filled):
+        wrong = sum(not is_data(text, missing) for text in filled)
+        if len(filled) > wrong and (wrong <= (1 - _SHARE) * len(filled) or wrong == 1 < len(filled) - 1):
             numeric.append(k)
     if not numeric:
         return None
@@ -165,19 +183,27 @@ def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None) -
         if len(fields) < 2 or not numbers or numbers == [str(k) for k in range(1, len(numbers) + 1)]:
             return False  # also names such as Target, 1, 2, 3
         word = re.sub(r"[^\w]", "", fields[0]).lower()
-        if (0 in numeric and not any(sign.isdigit() for sign in word)) or word in _STATISTICS:
+        if word in _STATISTICS or (0 in numeric and not any(sign.isdigit() for sign in word)):
             return False
-        return 2 * len(numbers) > len(cells) or len(fields) != width
+        begins = 0 in numeric and is_data(fields[0], missing)
+        return begins or len(fields) != width or 2 * len(numbers) > len(cells)
+
+    def is_below_names(above: Sequence[str], fields: Sequence[str]) -> bool:
+        """Whether a line with a number is below one that has only names."""
+        names = len(above) == len(fields) and not any(NUMERIC.fullmatch(text) for text in above)
+        return names and any(NUMERIC.fullmatch(text) for text in fields)
 
     first = 0 if header is False else next((k for k, (_, row) in enumerate(rows) if is_row(row)), None)
     if first is None:
         return None
     last = next(k for k in range(len(rows) - 1, -1, -1) if k == first or is_row(rows[k][1]))
-    while first > (1 if header else 0) and is_damaged(rows[first - 1][1]):
+    while first > (1 if header else 0) and (
+        is_damaged(rows[first - 1][1]) or (first > 1 and is_below_names(rows[first - 2][1], rows[first - 1][1]))
+    ):
         first -= 1
     while last < len(rows) - 1 and is_damaged(rows[last + 1][1]):
         last += 1
-    names, units = (None, None) if header is False else _heads(rows, first, width)
+    names, units = (None, None) if header is False else _heads(rows, first, width, slack)
     if header and names is None and first == 0:
         names, first = 0, 1
     return Body(width, first, last, names, units, tuple(numeric))
@@ -188,9 +214,9 @@ def is_unit(text: str) -> bool:
     return _BRACKETS.fullmatch(text) is not None or _UNIT.fullmatch(text) is not None
 
 
-def _heads(rows: Sequence[Line], first: int, width: int) -> tuple[int | None, int | None]:
+def _heads(rows: Sequence[Line], first: int, width: int, slack: int) -> tuple[int | None, int | None]:
     """Return the indices of the lines of names and units above the first row of numbers."""
-    above = [k for k in range(max(0, first - 3), first) if abs(len(rows[k][1]) - width) <= 1 and any(rows[k][1])]
+    above = [k for k in range(max(0, first - 3), first) if abs(len(rows[k][1]) - width) <= slack and any(rows[k][1])]
     if not above or above[-1] != first - 1:
         return None, None
     filled = [text for text in rows[first - 1][1] if text]

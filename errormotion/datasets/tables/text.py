@@ -47,13 +47,16 @@ def text_table(data: bytes, path: Path, form: Format) -> Table:
     if match := _SEPARATOR.fullmatch(lines[0].strip()):
         start = max(start, 1)
         form = form.model_copy(update={"delimiter": match[1] if form.delimiter == "auto" else form.delimiter})
+    if lines[0].startswith("LabVIEW Measurement"):
+        start = max(start, _after_lvm_header(lines, path))
     kept = [k for k in range(start, len(lines)) if lines[k].strip() and not _is_comment(lines[k], form)]
     if form.delimiter == "auto":
         head = [lines[k] for k in kept[: recognition.SAMPLE]]
         form = form.model_copy(update={"delimiter": delimiter_of(recognition.spread(head), form.missing)})
     sample = [*kept[: recognition.SAMPLE], *kept[recognition.SAMPLE :][-recognition.SAMPLE :]]
     rows = [(k, _split(lines[k], k + 1, form, path)) for k in sample]
-    body = body_of(rows, form.missing, form.header)
+    # Blanks also separate the words of a text above the table.
+    body = body_of(rows, form.missing, form.header, slack=0 if form.delimiter == " " else 1)
     if body is None:
         raise DatasetError(f"{path}: expected lines of numbers; found none", _shown(lines, kept))
     form = _marks(rows, body, form, path)
@@ -75,6 +78,18 @@ def text_table(data: bytes, path: Path, form: Format) -> Table:
         titles, units = [str(k + 1) for k in range(body.width)], [""] * body.width
         form = form.model_copy(update={"header": False})
     return Table(path, form, titles, units, head_line + 1, above, cells, notes)
+
+
+def _after_lvm_header(lines: Sequence[str], path: Path) -> int:
+    """Return the index of the line of names of a LabVIEW measurement file.
+
+    The end of the header of the file and of that of each segment has a line of its own (Specification for the LabVIEW
+    Measurement File, ni.com tutorial 4139).
+    """
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    if len(ends) > 2:
+        raise DatasetError(f"{path}: has {len(ends) - 1} segments, from line {ends[1] + 1} on; expected one")
+    return ends[-1] + 1 if ends else 1
 
 
 def _bound(lines: Sequence[str], path: Path) -> None:
@@ -214,14 +229,19 @@ class _TextCells(Cells):
     @cached_property
     def _regular(self) -> bool:
         """Whether pandas finds a row with every field in each line."""
-        if self.last - self.first < _MANY:
+        rows = self.source[self.first : self.last + 1]
+        if (
+            len(rows) <= _MANY
+            or self.source[self.head_line] in rows
+            or any(_is_comment(row, self.form) for row in rows)
+        ):
             return False
         try:
             last = self.body.width - 1
             frame = self._frame([last], str)
         except ValueError:
             return False
-        return len(frame) == self.last - self.first + 1 and not frame[last].isna().any()
+        return len(frame) == len(rows) and not frame[last].isna().any()
 
     @cached_property
     def _text(self) -> str:
@@ -277,5 +297,6 @@ class _TextCells(Cells):
             else:
                 damaged.append((k + 1, f"expected {width} fields; found {len(fields)}"))
         if repeated:
-            self.notes.append(f"{repeated} repetitions of the header between the rows")
+            times = "once" if repeated == 1 else f"{repeated} times"
+            self.notes.append(f"the header is repeated {times} between the rows")
         return rows, damaged

@@ -22,7 +22,7 @@ from errormotion.datasets.tables.numbers import NUMBER
 from errormotion.datasets.tables.reading import read_table as read_file
 from errormotion.datasets.tables.table import Place, Table
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
-from errormotion.datasets.text.log_reader import NOTES, clock_notes, holes, places_of
+from errormotion.datasets.text.log_reader import NOTES, clock_notes, holes, places_of, spread
 from errormotion.datasets.text.table_reader import (
     Cells,
     Column,
@@ -203,15 +203,19 @@ def _cells(table: Table, settings: LogMap, mistakes: Mistakes) -> tuple[Cells, s
     numeric = {where[0]: names[key] for key, where in places.items() if key.startswith("columns") and key not in dated}
     values = table.numbers(numeric, mistakes)
     clocks: dict[str, Clock] = {}
+    rest: list[str] = []
     numbers: dict[int, Array] = {}
     for k, (key, where) in enumerate(places.items()):
         if key in dated:
             numbers[k], clocks[key] = table.seconds(where, dated[key], names[key], mistakes, repeats=True)
+            if key == "columns.time" and not settings.labels:
+                numbers[k], equal = spread(numbers[k])
+                rest += equal
         elif where[0] in values:
             numbers[k] = values[where[0]]
     texts = {k: table.texts(where) for k, (key, where) in enumerate(places.items()) if key.startswith("labels")}
     start = next((clock.start.isoformat() for clock in clocks.values() if clock.start), "")
-    notes = [*table.notes, *(note for clock in clocks.values() for note in clock_notes(clock))]
+    notes = [*table.notes, *(note for clock in clocks.values() for note in clock_notes(clock)), *rest]
     time = next((k for k, key in enumerate(places) if key == "columns.time"), None)
     if time is not None and not mistakes.count:
         unit = "s" if "columns.time" in clocks else settings.columns["time"].unit

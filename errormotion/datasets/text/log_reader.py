@@ -80,7 +80,8 @@ def read_columns(
     if dates:
         values[time], clock = table.seconds(places[time], dates, names[time], mistakes, repeats=False)
         start = clock.start.isoformat() if clock.start else ""
-        notes += clock_notes(clock)
+        values[time], equal = spread(values[time])
+        notes += [*clock_notes(clock), *equal]
     unknown = np.flatnonzero(np.isnan(values[time]))
     texts = table.texts(places[time]) if unknown.size else []
     for k in unknown:
@@ -111,6 +112,22 @@ def clock_notes(clock: Clock) -> list[str]:
     if not clock.resolved:
         return []
     return [f"{clock.resolved} times of the hour that occurs twice in {clock.zone} were resolved by their order"]
+
+
+def spread(times: Array) -> tuple[Array, list[str]]:
+    """Return times of whole seconds with rows of the same second spread over it evenly, and a note.
+
+    Loggers that are faster than their clock write several rows with one time. ``times`` are in s, (n,); those with
+    parts of a second, or that decrease, are returned as they are.
+    """
+    if times.size < 2 or np.isnan(times).any() or (times % 1 != 0).any() or (np.diff(times) < 0).any():
+        return times, []
+    second, first, count = np.unique(times, return_index=True, return_counts=True)
+    if second.size < 2 or count.max() == 1:
+        return times, []
+    inside = np.arange(times.size) - np.repeat(first, count)
+    note = f"the clock of the log has whole seconds; up to {count.max()} rows of one second are spread over it evenly"
+    return times + inside / np.repeat(count, count), [note]
 
 
 def holes(times: Array, lines: NDArray[np.int64]) -> list[str]:
