@@ -224,3 +224,27 @@ def test_a_line_without_end_is_refused_before_it_is_in_memory(tmp_path: Path, en
         file.truncate(1 << 40)  # a sparse file, which fits into no memory
     with pytest.raises(DatasetError, match=r"log\.csv, line 3: expected at most \d+ characters"):
         read_table(log, Format(encoding=encoding, skip=3))
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "start", "missing"),
+    [
+        ("dat00001", [0, 1], "2009-01-26T08:07:12.237000", 0),  # milliseconds after a colon
+        ("datestr", [0, 1], "2024-05-31T14:05:09", 0),  # a month with its name
+        ("hms", [0, 1], "", 0),  # hh:mm:ss where the map states seconds
+        ("m9999b", [0, 1], "", 1),  # -9999 stated, -9999.0 in the log
+        ("mu1", [0, 60], "", 0),  # two micro signs
+        ("nbsp", [0, 60], "", 0),  # no-break space in names
+        ("pico", [0, 1], "", 0),  # units below the names
+        ("same1s", [0, 0.5], "2018-04-22T17:20:59", 0),  # several rows in a second
+        ("serial", [0, 1], "2024-05-31T14:05:09", 0),  # days of a spreadsheet
+        ("u16nobom", [0, 1], "", 0),  # UTF-16 without a mark
+    ],
+)
+def test_logs_of_real_devices(tmp_path: Path, name: str, times: list[float], start: str, missing: int) -> None:
+    folder = Path(__file__).parents[1] / "data" / "tables"
+    raw = import_log(folder / f"{name}.csv", folder / f"{name}.toml", tmp_path / "raw.nc")
+    np.testing.assert_allclose(raw["time"][:2], times, atol=1e-4)
+    assert raw.attrs.get("start", "") == start
+    assert sum(json.loads(raw.attrs["missing_values"]).values()) == missing
+    assert float(raw["distance"].sel(channel="X1")[0]) == pytest.approx(1e-3, rel=1e-12)

@@ -3,6 +3,7 @@
 They are tried as the codecs of the wire are (`wire_codecs`), but a file has a longer time: `Reader.limit`.
 """
 
+import io
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,6 +28,8 @@ from errormotion.datasets.clock import CLOCK, JOINS, age, notes
 from errormotion.datasets.files import events
 from errormotion.datasets.importing import _reader as log_reader
 from errormotion.datasets.tables.dates import Clock, zone_of
+from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.tables.reading import read_table
 from errormotion.datasets.text.readings_csv import read_csv
 from errormotion.datasets.units import KINDS, convert
 from errormotion.datasets.validation import validate
@@ -183,6 +186,37 @@ def readings(path: Path) -> None:
     validate(read_csv(path))
 
 
+def table(path: Path) -> None:
+    """Read every number of a table."""
+    found = read_table(path)
+    mistakes = Mistakes(path)
+    found.report(mistakes)
+    found.numbers({k: title for k, title in enumerate(found.titles)}, mistakes)
+    mistakes.raise_any()
+
+
+def workbook() -> bytes:
+    """Return a spreadsheet with three rows."""
+    from openpyxl import Workbook
+
+    book = Workbook()
+    for row in (["t [s]", "a [um]"], [0, 1.5], [1, 1.6], [2, 1.7]):
+        book.active.append(row)
+    data = io.BytesIO()
+    book.save(data)
+    return data.getvalue()
+
+
+def tdms() -> bytes:
+    """Return a file of LabVIEW with two channels."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    data = io.BytesIO()
+    with TdmsWriter(data) as writer:
+        writer.write_segment([ChannelObject("log", name, np.arange(4.0)) for name in ("t", "a")])
+    return data.getvalue()
+
+
 def run_file(path: Path) -> None:
     """Read the state of a run as the runner and as the record do."""
     both = (lambda: RunFolder.open(path.parent), lambda: read_entry(path.parent))
@@ -293,6 +327,8 @@ READERS: Sequence[Reader] = (
         *("file", "map of drift", named("b.toml", partial(logs, log=DRIFT, mapping="")), lambda: [DRIFT_MAP.encode()]),
         4096,
     ),
+    Reader("file", "spreadsheet", named("a.xlsx", table), lambda: [workbook()], 1 << 14),
+    Reader("file", "TDMS", named("a.tdms", table), lambda: [tdms()], 4096),
     Reader("file", "readings", named("readings.csv", readings), lambda: [READINGS.encode()], 4096),
     Reader("file", "heights", named("scan.csv", partial(read_scan, settings=GRID)), lambda: [HEIGHTS], 4096),
     Reader(

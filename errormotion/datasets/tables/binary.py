@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def binary_table(path: Path, form: Format, kind: str) -> Table:
         raise DatasetError(f"{path}: cannot be read as {kind}: {error}. Is the file complete?") from error
     lengths = {name: len(values) for name, values in columns.items()}
     if not lengths:
-        raise DatasetError(f"{path}: expected columns of numbers; found none")
+        raise DatasetError(f"{path}: expected columns of numbers; found none. Is the file complete?")
     longest = max(lengths.values())
     usual = [name for name, length in lengths.items() if length == longest]
     others = [name for name in lengths if name not in usual]
@@ -75,7 +76,9 @@ Columns = tuple[Mapping[str, Any], Mapping[str, str], list[str]]
 
 def _tdms(path: Path, form: Format) -> Columns:
     from nptdms import TdmsFile
+    from nptdms.log import log_manager
 
+    log_manager.set_level(logging.ERROR)  # it warns of what is refused or noted here
     columns: dict[str, Any] = {}
     units: dict[str, str] = {}
     notes: list[str] = []
@@ -115,7 +118,7 @@ def _matlab(path: Path, _form: Format) -> Columns:
 
 
 def _hdf5(path: Path, form: Format) -> Columns:
-    import h5py
+    import h5py  # type: ignore[import-untyped]
 
     found: dict[str, Any] = {}
     units: dict[str, str] = {}
@@ -135,7 +138,8 @@ def _hdf5(path: Path, form: Format) -> Columns:
 def _netcdf3(path: Path, _form: Format) -> Columns:
     from scipy.io import netcdf_file
 
-    found, units = {}, {}
+    found: dict[str, Any] = {}
+    units: dict[str, str] = {}
     with netcdf_file(path, "r", mmap=False) as file:
         for name, variable in file.variables.items():
             found[name] = variable[:].copy()

@@ -34,7 +34,7 @@ _TIME = (
 )
 _DIGITS = {
     "dd": "([0-9]{1,2})",
-    "mm": "([0-9]{1,2})",
+    "mm": r"([0-9]{1,2}|[^\W\d_]{3,9}\.?)",
     "yyyy": "([0-9]{4})",
     "yy": "([0-9]{2})",
     "mmm": r"([^\W\d_]{3,9})\.?",
@@ -87,6 +87,23 @@ def zone_of(name: str) -> tzinfo:
         raise ValueError("expected a time zone such as 'Europe/Berlin', 'UTC' or '+01:00'") from error
 
 
+def instant(value: float, unit: str) -> datetime | None:
+    """Return the date of a number that is plausible as one; None for other numbers.
+
+    Days from 2000 to 2100 are those of a spreadsheet; seconds to nanoseconds of these years are since 1970.
+    """
+    day = 86400.0
+    scale = {"d": day, "day": day, "days": day, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.get(unit)
+    if scale is None or not np.isfinite(value):
+        return None
+    kind = EXCEL if scale == day else UNIX
+    origin, _ = COUNTED[kind]
+    low, high = (datetime(year, 1, 1, tzinfo=origin.tzinfo) - origin for year in (2000, 2100))
+    if not low.total_seconds() <= value * scale < high.total_seconds():
+        return None
+    return origin + timedelta(seconds=round(value * scale, 3 if kind == EXCEL else 6))
+
+
 def fitting(texts: Sequence[str]) -> list[str]:
     """Return the units of dates and times with which every text of a sample can be read, the most usual first.
 
@@ -104,7 +121,7 @@ def fitting(texts: Sequence[str]) -> list[str]:
         except ValueError:
             continue
         found.append(unit)
-    return found
+    return [unit for unit in found if "mmm" in unit] or found
 
 
 @dataclass
@@ -204,7 +221,7 @@ class Clock:
             raise ValueError(expected)
         numbers = {}
         for k, part in enumerate((first, second, third), 1):
-            number = _MONTHS.get(match[k].lower()) if part == "mmm" else int(match[k])
+            number = int(match[k]) if match[k].isdigit() else _MONTHS.get(match[k].rstrip(".").lower())
             if number is None:
                 raise ValueError(expected)
             numbers[_PARTS[part]] = number
@@ -281,7 +298,8 @@ def _fixed(texts: Sequence[str], unit: str) -> NDArray[np.datetime64] | None:
     decimals = length - 20
     parts = number(20, decimals) * 10 ** (9 - decimals) if decimals > 0 else 0
     clock = ((hour * 60 + minute) * 60 + second) * 10**9 + parts
-    return days.astype("datetime64[ns]") + np.asarray(clock).astype("timedelta64[ns]")
+    stamps: NDArray[np.datetime64] = days.astype("datetime64[ns]") + np.asarray(clock).astype("timedelta64[ns]")
+    return stamps
 
 
 def _difference(later: datetime, earlier: datetime) -> float:

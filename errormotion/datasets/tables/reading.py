@@ -41,7 +41,7 @@ def read_table(path: str | Path, form: Format | None = None) -> Table:
     DatasetError
         The file cannot be read, is too large, or has no table of numbers.
     """
-    path, form = Path(path), form or Format()
+    path, form = Path(path), form or Format.model_validate({})
     try:
         require_regular(path)
         with path.open("rb") as file:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import zlib
 from collections.abc import Sequence
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -17,6 +19,8 @@ from errormotion.datasets.tables.numbers import signs
 from errormotion.datasets.tables.table import Cells, Table, named, same
 from errormotion.errors import DatasetError
 
+MAX_UNPACKED = 1 << 29
+"""Largest sum of the sizes of the parts of a packed file, bytes."""
 MAX_CELLS = 20_000_000
 """Largest number of cells of a sheet."""
 
@@ -32,13 +36,15 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
     from python_calamine import CalamineError, CalamineWorkbook
 
     try:
+        if data.startswith(b"PK"):
+            _require_small(data, path)
         book = CalamineWorkbook.from_filelike(io.BytesIO(data))
         names = book.sheet_names
         wanted = [form.sheet] if form.sheet else names
         if form.sheet and form.sheet not in names:
             raise DatasetError(f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}")
         tables = [table for name in wanted if (table := _table(book, name, path, form)) is not None]
-    except (CalamineError, OSError, ValueError) as error:
+    except (CalamineError, BadZipFile, NotImplementedError, OSError, RuntimeError, ValueError, zlib.error) as error:
         raise DatasetError(f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?") from error
     if not tables:
         raise DatasetError(f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none")
@@ -46,6 +52,18 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         found = ", ".join(f"'{table.form.sheet}'" for table in tables)
         raise DatasetError(f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map")
     return tables[0]
+
+
+def _require_small(data: bytes, path: Path) -> None:
+    """Raise DatasetError if the parts of a packed file are larger than `MAX_UNPACKED`, whatever its directory states."""
+    rest = MAX_UNPACKED
+    with ZipFile(io.BytesIO(data)) as parts:
+        for part in parts.infolist():
+            with parts.open(part) as file:
+                while piece := file.read(1 << 20):
+                    rest -= len(piece)
+                    if rest < 0:
+                        raise DatasetError(f"{path}: expected at most {MAX_UNPACKED} bytes when unpacked; found more")
 
 
 def _table(book: object, name: str, path: Path, form: Format) -> Table | None:
@@ -66,9 +84,7 @@ def _table(book: object, name: str, path: Path, form: Format) -> Table | None:
     if rest := len(rows) - 1 - body.last:
         notes.append(f"{rest} rows below the table not read, from row {rows[body.last + 1][0] + 1} on")
     texts = [row[j] for _, row in inside for j in body.numeric if j < len(row) and isinstance(row[j], str)]
-    decimal = form.decimal
-    if decimal == "auto":
-        decimal = signs(texts[:4000])[0] or "."
+    decimal = (signs(texts[:4000])[0] or ".") if form.decimal == "auto" else form.decimal
     head = rows[body.header][1] if body.header is not None else []
     second = rows[body.units][1] if body.units is not None else None
     titles, units = named(head[: body.width], second)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +248,7 @@ class _TextCells(Cells):
     def _text(self) -> str:
         return "\n".join(self.source[self.first : self.last + 1])
 
-    def _frame(self, columns: list[int], kind: type) -> "pd.DataFrame":  # noqa: F821, UP037
+    def _frame(self, columns: list[int], kind: type) -> Any:
         import pandas as pd
 
         missing = ["", *NO_VALUE, *(text.upper() for text in NO_VALUE), "NaN", *self.form.missing]

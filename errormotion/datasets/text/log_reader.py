@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.datasets.tables.dates import Clock
+from errormotion.datasets.tables.dates import ELAPSED, Clock, fitting, instant, is_date
 from errormotion.datasets.tables.format import Format
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.tables.numbers import no_value
@@ -35,6 +35,8 @@ class Columns:
         By the caller's key, in the units of the log; NaN for no value. Dates are in s since the first line.
     lines : ndarray, (n,)
         Line of each value.
+    time_unit : str
+        Unit of the times: s for dates, else that of the map.
     start : str
         Date and time of the first line, if the log has dates.
     notes : list of str
@@ -43,13 +45,12 @@ class Columns:
 
     values: dict[str, Array]
     lines: NDArray[np.int64]
+    time_unit: str
     start: str = ""
     notes: list[str] = field(default_factory=list)
 
 
-def read_columns(
-    wanted: Mapping[str, Place], time: str, form: Format, mistakes: Mistakes, *, dates: str = ""
-) -> Columns:
+def read_columns(wanted: Mapping[str, Place], time: str, unit: str, form: Format, mistakes: Mistakes) -> Columns:
     """Read columns of the log ``mistakes.path``.
 
     Parameters
@@ -58,12 +59,12 @@ def read_columns(
         Column of each key: its name in the header, or its number from 1; two for date and time of day.
     time : str
         Key of the time, whose cells must not be empty.
+    unit : str
+        Unit of the time, or the one of dates (`errormotion.datasets.tables.dates`).
     form : Format
         Format of the table.
     mistakes : Mistakes
         Receives the mistakes in the cells.
-    dates : str
-        Unit of dates (`errormotion.datasets.tables.dates`), if the times are dates.
 
     Raises
     ------
@@ -73,6 +74,7 @@ def read_columns(
     table = read_table(mistakes.path, form)
     places = places_of(table, wanted, mistakes)
     names = {key: f"{key}, field {where[0] + 1}" for key, where in places.items()}
+    dates = unit if is_date(unit) else clocked(table, places[time])
     numeric = {where[0]: names[key] for key, where in places.items() if not (key == time and dates)}
     found = table.numbers(numeric, mistakes)
     values = {key: found[where[0]] for key, where in places.items() if where[0] in found and len(where) == 1}
@@ -82,12 +84,16 @@ def read_columns(
         start = clock.start.isoformat() if clock.start else ""
         values[time], equal = spread(values[time])
         notes += [*clock_notes(clock), *equal]
+    elif first := instant(float(values[time][0]), unit):
+        start = first.isoformat()
+        values[time] = values[time] - values[time][0]
+        notes.append(f"the times are dates as numbers, the first one is {start}")
     unknown = np.flatnonzero(np.isnan(values[time]))
     texts = table.texts(places[time]) if unknown.size else []
     for k in unknown:
         if no_value(texts[k], form.missing):
             mistakes.add(int(table.lines[k]), f"{names[time]}: expected a number; found an empty cell")
-    return Columns(values, table.lines, start, notes)
+    return Columns(values, table.lines, "s" if dates else unit, start, notes)
 
 
 def places_of(table: Table, wanted: Mapping[str, Place], mistakes: Mistakes) -> dict[str, list[int]]:
@@ -105,6 +111,12 @@ def places_of(table: Table, wanted: Mapping[str, Place], mistakes: Mistakes) -> 
     mistakes.raise_any()
     table.report(mistakes)
     return places
+
+
+def clocked(table: Table, column: Sequence[int]) -> str:
+    """Return the unit of times such as 00:05:09 where a unit of numbers is stated; empty for numbers."""
+    shown = [text for text in table.texts(column)[:5] if text]
+    return ELAPSED if shown and ELAPSED in fitting(shown) else ""
 
 
 def clock_notes(clock: Clock) -> list[str]:

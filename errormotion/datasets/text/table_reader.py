@@ -318,7 +318,7 @@ def _places(
         leading = np.unique(leading * (int(at.max(initial=0)) + 1) + at, return_inverse=True)[1].reshape(n)
     _, first, inverse = np.unique(leading, return_index=True, return_inverse=True)
     for k in np.flatnonzero(first[inverse] != np.arange(n)):
-        label = ", ".join(f"{dim} '{table.texts[keys[dim]][k]}'" for dim in record)
+        label = ", ".join(f"{dim} '{table.texts[keys[dim]][int(k)]}'" for dim in record)
         before = int(table.lines[first[inverse[k]]])
         mistakes.add(int(table.lines[k]), f"{label}: duplicate; first given in line {before}", "duplicate")
     for dim, at in zip(record, places, strict=True):

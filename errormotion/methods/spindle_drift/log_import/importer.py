@@ -11,7 +11,6 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model
-from errormotion.datasets.tables.dates import is_date
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.text.log_reader import NOTES, Columns, Place, holes, read_columns
 from errormotion.datasets.units import convert
@@ -46,8 +45,7 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     """
     settings = load_model(map_file, ImportMap, error=DatasetError)
     mistakes = Mistakes(log)
-    dates = settings.time.unit if is_date(settings.time.unit) else ""
-    columns = read_columns(_columns_of(settings), "time", settings.format, mistakes, dates=dates)
+    columns = read_columns(_columns_of(settings), "time", settings.time.unit, settings.format, mistakes)
     _check_times(columns, mistakes)
     _check_magnitudes(columns, settings, mistakes)
     mistakes.raise_any()
@@ -85,7 +83,7 @@ def _check_magnitudes(columns: Columns, settings: ImportMap, mistakes: Mistakes)
     """Report the first implausible value of each column."""
     for key, values in columns.values.items():
         row = _ROWS[_VARIABLE[key.partition(".")[0]]]
-        inside = _inside(key, values, settings)
+        inside = _inside(key, columns, settings)
         outside = np.flatnonzero((inside < row.low) | (inside > row.high))
         if outside.size:
             first, unit = outside[0], _column(key, settings).unit
@@ -106,12 +104,11 @@ def _column(key: str, settings: ImportMap) -> TimeColumn | Channel | Temperature
     return settings.spindle_speed if table == "spindle_speed" and settings.spindle_speed else settings.time
 
 
-def _inside(key: str, values: Array, settings: ImportMap) -> Array:
+def _inside(key: str, columns: Columns, settings: ImportMap) -> Array:
     """Return a column in the unit of the schema."""
     column = _column(key, settings)
-    if is_date(column.unit):
-        return values
-    inside = np.asarray(convert(values, column.unit, _ROWS[_VARIABLE[key.partition(".")[0]]].unit))
+    unit = columns.time_unit if key == "time" else column.unit
+    inside = np.asarray(convert(columns.values[key], unit, _ROWS[_VARIABLE[key.partition(".")[0]]].unit))
     return inside * column.scale + column.offset if isinstance(column, Channel) else inside
 
 
@@ -119,7 +116,7 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
     channels = [settings.channels[name] for name in CHANNELS]
     direction = np.array([channel.direction for channel in channels])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    inside = {key: _inside(key, values, settings) for key, values in columns.values.items()}
+    inside = {key: _inside(key, columns, settings) for key in columns.values}
     metre = {"units": "m"}
     variables: dict[str, Any] = {
         "distance": (("channel", "time"), np.stack([inside[f"channels.{name}"] for name in CHANNELS]), metre),
