@@ -191,7 +191,7 @@ def table(path: Path) -> None:
     found = read_table(path)
     mistakes = Mistakes(path)
     found.report(mistakes)
-    found.numbers({k: title for k, title in enumerate(found.titles)}, mistakes)
+    found.numbers(dict(enumerate(found.titles)), mistakes)
     mistakes.raise_any()
 
 

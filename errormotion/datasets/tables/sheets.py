@@ -55,7 +55,7 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
 
 
 def _require_small(data: bytes, path: Path) -> None:
-    """Raise DatasetError if the parts of a packed file are larger than `MAX_UNPACKED`, whatever its directory states."""
+    """Raise DatasetError if the parts of a packed file are larger than `MAX_UNPACKED`, whatever it states."""
     rest = MAX_UNPACKED
     with ZipFile(io.BytesIO(data)) as parts:
         for part in parts.infolist():
