@@ -44,7 +44,16 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         if form.sheet and form.sheet not in names:
             raise DatasetError(f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}")
         tables = [table for name in wanted if (table := _table(book, name, path, form)) is not None]
-    except (CalamineError, BadZipFile, NotImplementedError, OSError, RuntimeError, ValueError, zlib.error) as error:
+    except (
+        CalamineError,
+        BadZipFile,
+        EOFError,
+        NotImplementedError,
+        OSError,
+        RuntimeError,
+        ValueError,
+        zlib.error,
+    ) as error:
         raise DatasetError(f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?") from error
     if not tables:
         raise DatasetError(f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none")
