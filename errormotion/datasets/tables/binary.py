@@ -55,17 +55,23 @@ def binary_table(path: Path, form: Format, kind: str) -> Table:
     except DatasetError:
         raise
     except Exception as error:  # readers of others raise errors of any kind for damaged files
-        raise DatasetError(f"{path}: cannot be read as {kind}: {error}. Is the file complete?") from error
+        raise DatasetError(
+            f"{path}: cannot be read as {kind}: {error}. Is the file complete?", code="table.unreadable"
+        ) from error
     lengths = {name: len(values) for name, values in columns.items()}
     if not lengths:
-        raise DatasetError(f"{path}: expected columns of numbers; found none. Is the file complete?")
+        raise DatasetError(
+            f"{path}: expected columns of numbers; found none. Is the file complete?", code="table.no_numbers"
+        )
     longest = max(lengths.values())
     usual = [name for name, length in lengths.items() if length == longest]
     others = [name for name in lengths if name not in usual]
     if others:
         notes.append(f"columns of another length than {longest} are left out: {', '.join(others[:5])}")
     if sum(lengths.values()) > MAX_VALUES:
-        raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found {sum(lengths.values())}")
+        raise DatasetError(
+            f"{path}: expected at most {MAX_VALUES} values; found {sum(lengths.values())}", code="table.too_large"
+        )
     known = form.model_copy(update={"header": True, "decimal": "."})
     cells = ArrayCells([np.asarray(columns[name]) for name in usual])
     return Table(path, known, usual, [units.get(name, "") for name in usual], 1, [], cells, notes)
@@ -87,14 +93,19 @@ def _tdms(path: Path, form: Format) -> Columns:
         if form.sheet:
             names = [group.name for group in groups]
             if form.sheet not in names:
-                raise DatasetError(f"{path}: no group '{form.sheet}'; {nearest(form.sheet, names)}")
+                raise DatasetError(
+                    f"{path}: no group '{form.sheet}'; {nearest(form.sheet, names)}", code="table.sheet.unknown"
+                )
             groups = [group for group in groups if group.name == form.sheet]
         elif len(groups) > 1:
             names = [f"'{group.name}'" for group in groups]
-            raise DatasetError(f"{path}: expected one group; found {', '.join(names)}. Set format.sheet in the map")
+            raise DatasetError(
+                f"{path}: expected one group; found {', '.join(names)}. Set format.sheet in the map",
+                code="table.sheet.several",
+            )
         channels = groups[0].channels() if groups else []
         if sum(len(channel) for channel in channels) > MAX_VALUES:
-            raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more")
+            raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="table.too_large")
         for channel in channels:
             columns[channel.name] = channel[:]
             units[channel.name] = str(
@@ -113,7 +124,7 @@ def _matlab(path: Path, _form: Format) -> Columns:
 
     sizes = {name: shape for name, shape, _ in whosmat(path)}
     if sum(int(np.prod(shape)) for shape in sizes.values()) > MAX_VALUES:
-        raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more")
+        raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="table.too_large")
     return _columns({name: array for name, array in loadmat(path).items() if not name.startswith("__")}), {}, []
 
 

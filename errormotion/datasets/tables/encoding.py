@@ -49,10 +49,11 @@ def decode(data: bytes, encoding: str, path: Path) -> tuple[str, str]:
         line = data[: error.start].count(b"\n") + 1
         raise DatasetError(
             f"{path}, line {line}: byte 0x{data[error.start]:02x} is not {encoding}; set format.encoding in the map to "
-            "the encoding of the file, such as 'cp1252', or leave it out"
+            "the encoding of the file, such as 'cp1252', or leave it out",
+            code="text.encoding",
         ) from error
     except UnicodeError as error:
-        raise DatasetError(f"{path}: is not {encoding}: {error}") from error
+        raise DatasetError(f"{path}: is not {encoding}: {error}", code="text.encoding") from error
     return text.removeprefix("\ufeff"), known
 
 
@@ -85,7 +86,9 @@ def _wide(sample: bytes, path: Path) -> str:
         return "utf-16-le"
     if even > 0.6 * half and odd < 0.1 * half:
         return "utf-16-be"
-    raise DatasetError(f"{path}: contains zero bytes; expected text. Is it a binary file of a program?")
+    raise DatasetError(
+        f"{path}: contains zero bytes; expected text. Is it a binary file of a program?", code="text.encoding"
+    )
 
 
 def _legacy(data: bytes) -> str:

@@ -51,11 +51,11 @@ def read_table(path: str | Path, form: Format | None = None) -> Table:
             return binary_table(path, form, kind)
         data = read_bytes(path, MAX_FILE) if start.startswith(_SHEETS) else _text(path)
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", code="file.unreadable") from error
     if start.startswith(_SHEETS):
         return sheet_table(data, path, form)
     if not data.strip():
-        raise DatasetError(f"{path}: expected lines of numbers; the file is empty")
+        raise DatasetError(f"{path}: expected lines of numbers; the file is empty", code="table.no_numbers")
     return text_table(data, path, form)
 
 
@@ -69,9 +69,12 @@ def _text(path: Path) -> bytes:
             ends = max(part.rfind(b"\n"), part.rfind(b"\r"))
             since = len(part) - ends if ends >= 0 else since + len(part)
             if since > 4 * MAX_LINE:  # four bytes are a character at most
-                raise DatasetError(f"{path}, line {line + 1}: expected at most {MAX_LINE} characters; it is longer")
+                raise DatasetError(
+                    f"{path}, line {line + 1}: expected at most {MAX_LINE} characters; it is longer",
+                    code="table.too_large",
+                )
             if length > MAX_FILE:
-                raise DatasetError(f"{path}: expected at most {MAX_FILE} bytes; it is longer")
+                raise DatasetError(f"{path}: expected at most {MAX_FILE} bytes; it is longer", code="table.too_large")
             line += part.count(b"\n")
             parts.append(part)
     return b"".join(parts)

@@ -42,7 +42,9 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         names = book.sheet_names
         wanted = [form.sheet] if form.sheet else names
         if form.sheet and form.sheet not in names:
-            raise DatasetError(f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}")
+            raise DatasetError(
+                f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}", code="table.sheet.unknown"
+            )
         tables = [table for name in wanted if (table := _table(book, name, path, form)) is not None]
     except (
         CalamineError,
@@ -54,12 +56,19 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         ValueError,
         zlib.error,
     ) as error:
-        raise DatasetError(f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?") from error
+        raise DatasetError(
+            f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?", code="table.unreadable"
+        ) from error
     if not tables:
-        raise DatasetError(f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none")
+        raise DatasetError(
+            f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none", code="table.no_numbers"
+        )
     if len(tables) > 1:
         found = ", ".join(f"'{table.form.sheet}'" for table in tables)
-        raise DatasetError(f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map")
+        raise DatasetError(
+            f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map",
+            code="table.sheet.several",
+        )
     return tables[0]
 
 
@@ -72,13 +81,18 @@ def _require_small(data: bytes, path: Path) -> None:
                 while piece := file.read(1 << 20):
                     rest -= len(piece)
                     if rest < 0:
-                        raise DatasetError(f"{path}: expected at most {MAX_UNPACKED} bytes when unpacked; found more")
+                        raise DatasetError(
+                            f"{path}: expected at most {MAX_UNPACKED} bytes when unpacked; found more",
+                            code="table.too_large",
+                        )
 
 
 def _table(book: object, name: str, path: Path, form: Format) -> Table | None:
     sheet = book.get_sheet_by_name(name)  # type: ignore[attr-defined]
     if (sheet.height or 0) * (sheet.width or 0) > MAX_CELLS:
-        raise DatasetError(f"{path}, sheet '{name}': expected at most {MAX_CELLS} cells; found more")
+        raise DatasetError(
+            f"{path}, sheet '{name}': expected at most {MAX_CELLS} cells; found more", code="table.too_large"
+        )
     grid = sheet.to_python(skip_empty_area=False)
     filled = [k for k, row in enumerate(grid) if k >= form.skip and any(cell not in ("", None) for cell in row)]
     kept = [k for k in filled if not (form.comment and str(grid[k][0]).startswith(form.comment))]

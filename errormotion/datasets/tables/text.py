@@ -59,7 +59,9 @@ def text_table(data: bytes, path: Path, form: Format) -> Table:
     # Blanks also separate the words of a text above the table.
     body = body_of(rows, form.missing, form.header, slack=0 if form.delimiter == " " else 1)
     if body is None:
-        raise DatasetError(f"{path}: expected lines of numbers; found none", _shown(lines, kept))
+        raise DatasetError(
+            f"{path}: expected lines of numbers; found none", _shown(lines, kept), code="table.no_numbers"
+        )
     form = _marks(rows, body, form, path)
     first, last = rows[body.first][0], rows[body.last][0]
     notes: list[str] = []
@@ -89,14 +91,19 @@ def _after_lvm_header(lines: Sequence[str], path: Path) -> int:
     """
     ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
     if len(ends) > 2:
-        raise DatasetError(f"{path}: has {len(ends) - 1} segments, from line {ends[1] + 1} on; expected one")
+        raise DatasetError(
+            f"{path}: has {len(ends) - 1} segments, from line {ends[1] + 1} on; expected one",
+            code="table.sheet.several",
+        )
     return ends[-1] + 1 if ends else 1
 
 
 def _bound(lines: Sequence[str], path: Path) -> None:
     for k, line in enumerate(lines, 1):
         if len(line) > MAX_LINE:
-            raise DatasetError(f"{path}, line {k}: expected at most {MAX_LINE} characters; it is longer")
+            raise DatasetError(
+                f"{path}, line {k}: expected at most {MAX_LINE} characters; it is longer", code="table.too_large"
+            )
 
 
 def _is_comment(line: str, form: Format) -> bool:
@@ -107,7 +114,9 @@ def _split(line: str, number: int, form: Format, path: Path) -> list[str]:
     try:
         return split(line, form.delimiter)
     except csv.Error as error:
-        raise DatasetError(f"{path}, line {number}: cannot be split into fields: {error}") from error
+        raise DatasetError(
+            f"{path}, line {number}: cannot be split into fields: {error}", code="table.row.quotes"
+        ) from error
 
 
 def _shown(lines: Sequence[str], kept: Sequence[int]) -> list[str]:
@@ -126,12 +135,14 @@ def _marks(rows: Sequence[Line], body: Body, form: Format, path: Path) -> Format
     if not decimal:
         raise DatasetError(
             f"{path}: some numbers have a comma and others a point, such as '{unclear}'; set format.decimal and "
-            "format.thousands in the map"
+            "format.thousands in the map",
+            code="table.numbers.ambiguous",
         )
     if unclear and form.thousands is None:
         raise DatasetError(
             f"{path}: the comma in '{unclear}' may be the decimal sign or separate thousands; set format.decimal = ',' "
-            "or format.thousands = ',' in the map"
+            "or format.thousands = ',' in the map",
+            code="table.numbers.ambiguous",
         )
     if form.thousands == decimal:
         decimal = "." if decimal == "," else ","
@@ -179,7 +190,8 @@ def _complete(lines: Sequence[str], rows: Sequence[Line], body: Body, path: Path
     if len(decimals) > 3 and min(decimals[:-1]) > decimals[-1]:
         raise DatasetError(
             f"{path}, line {len(lines)}: the file ends in '{column[-1]}', which has fewer decimals than all numbers "
-            "above it, and no end of the line. Is the file complete?"
+            "above it, and no end of the line. Is the file complete?",
+            code="table.incomplete",
         )
 
 
