@@ -56,12 +56,12 @@ def binary_table(path: Path, form: Format, kind: str) -> Table:
         raise
     except Exception as error:  # readers of others raise errors of any kind for damaged files
         raise DatasetError(
-            f"{path}: cannot be read as {kind}: {error}. Is the file complete?", code="table.unreadable"
+            f"{path}: cannot be read as {kind}: {error}. Is the file complete?", code="file.unreadable"
         ) from error
     lengths = {name: len(values) for name, values in columns.items()}
     if not lengths:
         raise DatasetError(
-            f"{path}: expected columns of numbers; found none. Is the file complete?", code="table.no_numbers"
+            f"{path}: expected columns of numbers; found none. Is the file complete?", code="file.no_numbers"
         )
     longest = max(lengths.values())
     usual = [name for name, length in lengths.items() if length == longest]
@@ -70,7 +70,7 @@ def binary_table(path: Path, form: Format, kind: str) -> Table:
         notes.append(f"columns of another length than {longest} are left out: {', '.join(others[:5])}")
     if sum(lengths.values()) > MAX_VALUES:
         raise DatasetError(
-            f"{path}: expected at most {MAX_VALUES} values; found {sum(lengths.values())}", code="table.too_large"
+            f"{path}: expected at most {MAX_VALUES} values; found {sum(lengths.values())}", code="file.too_large"
         )
     known = form.model_copy(update={"header": True, "decimal": "."})
     cells = ArrayCells([np.asarray(columns[name]) for name in usual])
@@ -94,18 +94,18 @@ def _tdms(path: Path, form: Format) -> Columns:
             names = [group.name for group in groups]
             if form.sheet not in names:
                 raise DatasetError(
-                    f"{path}: no group '{form.sheet}'; {nearest(form.sheet, names)}", code="table.sheet.unknown"
+                    f"{path}: no group '{form.sheet}'; {nearest(form.sheet, names)}", code="file.sheet.unknown"
                 )
             groups = [group for group in groups if group.name == form.sheet]
         elif len(groups) > 1:
             names = [f"'{group.name}'" for group in groups]
             raise DatasetError(
                 f"{path}: expected one group; found {', '.join(names)}. Set format.sheet in the map",
-                code="table.sheet.several",
+                code="file.sheet.several",
             )
         channels = groups[0].channels() if groups else []
         if sum(len(channel) for channel in channels) > MAX_VALUES:
-            raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="table.too_large")
+            raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="file.too_large")
         for channel in channels:
             columns[channel.name] = channel[:]
             units[channel.name] = str(
@@ -124,7 +124,7 @@ def _matlab(path: Path, _form: Format) -> Columns:
 
     sizes = {name: shape for name, shape, _ in whosmat(path)}
     if sum(int(np.prod(shape)) for shape in sizes.values()) > MAX_VALUES:
-        raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="table.too_large")
+        raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="file.too_large")
     return _columns({name: array for name, array in loadmat(path).items() if not name.startswith("__")}), {}, []
 
 

@@ -55,7 +55,7 @@ def read_table(path: str | Path, form: Format | None = None) -> Table:
     if start.startswith(_SHEETS):
         return sheet_table(data, path, form)
     if not data.strip():
-        raise DatasetError(f"{path}: expected lines of numbers; the file is empty", code="table.no_numbers")
+        raise DatasetError(f"{path}: expected lines of numbers; the file is empty", code="file.no_numbers")
     return text_table(data, path, form)
 
 
@@ -71,10 +71,10 @@ def _text(path: Path) -> bytes:
             if since > 4 * MAX_LINE:  # four bytes are a character at most
                 raise DatasetError(
                     f"{path}, line {line + 1}: expected at most {MAX_LINE} characters; it is longer",
-                    code="table.too_large",
+                    code="file.too_large",
                 )
             if length > MAX_FILE:
-                raise DatasetError(f"{path}: expected at most {MAX_FILE} bytes; it is longer", code="table.too_large")
+                raise DatasetError(f"{path}: expected at most {MAX_FILE} bytes; it is longer", code="file.too_large")
             line += part.count(b"\n")
             parts.append(part)
     return b"".join(parts)

@@ -43,7 +43,7 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         wanted = [form.sheet] if form.sheet else names
         if form.sheet and form.sheet not in names:
             raise DatasetError(
-                f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}", code="table.sheet.unknown"
+                f"{path}: no sheet '{form.sheet}'; {nearest(form.sheet, names)}", code="file.sheet.unknown"
             )
         tables = [table for name in wanted if (table := _table(book, name, path, form)) is not None]
     except (
@@ -57,17 +57,17 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         zlib.error,
     ) as error:
         raise DatasetError(
-            f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?", code="table.unreadable"
+            f"{path}: cannot be read as a spreadsheet: {error}. Is it complete?", code="file.unreadable"
         ) from error
     if not tables:
         raise DatasetError(
-            f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none", code="table.no_numbers"
+            f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none", code="file.no_numbers"
         )
     if len(tables) > 1:
         found = ", ".join(f"'{table.form.sheet}'" for table in tables)
         raise DatasetError(
             f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map",
-            code="table.sheet.several",
+            code="file.sheet.several",
         )
     return tables[0]
 
@@ -83,7 +83,7 @@ def _require_small(data: bytes, path: Path) -> None:
                     if rest < 0:
                         raise DatasetError(
                             f"{path}: expected at most {MAX_UNPACKED} bytes when unpacked; found more",
-                            code="table.too_large",
+                            code="file.too_large",
                         )
 
 
@@ -91,7 +91,7 @@ def _table(book: object, name: str, path: Path, form: Format) -> Table | None:
     sheet = book.get_sheet_by_name(name)  # type: ignore[attr-defined]
     if (sheet.height or 0) * (sheet.width or 0) > MAX_CELLS:
         raise DatasetError(
-            f"{path}, sheet '{name}': expected at most {MAX_CELLS} cells; found more", code="table.too_large"
+            f"{path}, sheet '{name}': expected at most {MAX_CELLS} cells; found more", code="file.too_large"
         )
     grid = sheet.to_python(skip_empty_area=False)
     filled = [k for k, row in enumerate(grid) if k >= form.skip and any(cell not in ("", None) for cell in row)]

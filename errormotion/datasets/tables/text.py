@@ -60,7 +60,7 @@ def text_table(data: bytes, path: Path, form: Format) -> Table:
     body = body_of(rows, form.missing, form.header, slack=0 if form.delimiter == " " else 1)
     if body is None:
         raise DatasetError(
-            f"{path}: expected lines of numbers; found none", _shown(lines, kept), code="table.no_numbers"
+            f"{path}: expected lines of numbers; found none", _shown(lines, kept), code="file.no_numbers"
         )
     form = _marks(rows, body, form, path)
     first, last = rows[body.first][0], rows[body.last][0]
@@ -93,7 +93,7 @@ def _after_lvm_header(lines: Sequence[str], path: Path) -> int:
     if len(ends) > 2:
         raise DatasetError(
             f"{path}: has {len(ends) - 1} segments, from line {ends[1] + 1} on; expected one",
-            code="table.sheet.several",
+            code="file.sheet.several",
         )
     return ends[-1] + 1 if ends else 1
 
@@ -102,7 +102,7 @@ def _bound(lines: Sequence[str], path: Path) -> None:
     for k, line in enumerate(lines, 1):
         if len(line) > MAX_LINE:
             raise DatasetError(
-                f"{path}, line {k}: expected at most {MAX_LINE} characters; it is longer", code="table.too_large"
+                f"{path}, line {k}: expected at most {MAX_LINE} characters; it is longer", code="file.too_large"
             )
 
 
@@ -115,7 +115,7 @@ def _split(line: str, number: int, form: Format, path: Path) -> list[str]:
         return split(line, form.delimiter)
     except csv.Error as error:
         raise DatasetError(
-            f"{path}, line {number}: cannot be split into fields: {error}", code="table.row.quotes"
+            f"{path}, line {number}: cannot be split into fields: {error}", code="csv.fields"
         ) from error
 
 
@@ -136,13 +136,13 @@ def _marks(rows: Sequence[Line], body: Body, form: Format, path: Path) -> Format
         raise DatasetError(
             f"{path}: some numbers have a comma and others a point, such as '{unclear}'; set format.decimal and "
             "format.thousands in the map",
-            code="table.numbers.ambiguous",
+            code="file.numbers.ambiguous",
         )
     if unclear and form.thousands is None:
         raise DatasetError(
             f"{path}: the comma in '{unclear}' may be the decimal sign or separate thousands; set format.decimal = ',' "
             "or format.thousands = ',' in the map",
-            code="table.numbers.ambiguous",
+            code="file.numbers.ambiguous",
         )
     if form.thousands == decimal:
         decimal = "." if decimal == "," else ","
@@ -191,7 +191,7 @@ def _complete(lines: Sequence[str], rows: Sequence[Line], body: Body, path: Path
         raise DatasetError(
             f"{path}, line {len(lines)}: the file ends in '{column[-1]}', which has fewer decimals than all numbers "
             "above it, and no end of the line. Is the file complete?",
-            code="table.incomplete",
+            code="file.incomplete",
         )
 
 
