@@ -114,9 +114,7 @@ def _split(line: str, number: int, form: Format, path: Path) -> list[str]:
     try:
         return split(line, form.delimiter)
     except csv.Error as error:
-        raise DatasetError(
-            f"{path}, line {number}: cannot be split into fields: {error}", code="csv.fields"
-        ) from error
+        raise DatasetError(f"{path}, line {number}: cannot be split into fields: {error}", code="csv.fields") from error
 
 
 def _shown(lines: Sequence[str], kept: Sequence[int]) -> list[str]:
