@@ -1,0 +1,268 @@
+"""The synchronous part of the readings: their mean over turns, as harmonics, and how it scatters from batch to batch.
+
+The record is divided into batches of whole turns. In each of them the readings are averaged in parts of a turn, and
+
+    m(q) = a_0 + sum_k (a_k cos k q + b_k sin k q),    k = 1 ... K,
+
+is fitted to these means. A mean over a part with the variance v of the angles in it has ``1 - k^2 v / 2`` of a
+harmonic. The batches are independent but for slow changes, so that the covariance of their mean follows from their
+scatter, with whatever correlation the motion has along the turn and between sensors:
+
+    x = sum_b x_b / B,    cov x = sum_b (x_b - x) (x_b - x)' / (B (B - 1)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from errormotion.arrays import Array
+from errormotion.errors import MethodError
+from errormotion.estimation.robust import scale_about_zero
+from errormotion.estimation.variance import expansion
+from errormotion.methods.spindle_error_motion.averaging import add_up
+from errormotion.methods.spindle_error_motion.turning import TAU, Turning, angles_of, chunks
+
+BATCHES = 32
+FEWEST_BATCHES = 4
+PARTS = 1024
+"""Most parts of a turn."""
+LONG = 100
+"""Turns of a batch from which on its mean is a slow change, not a part of the asynchronous motion."""
+SPIKE = 8.0
+"""Distance of a spike from its neighbours, in robust standard deviations."""
+SPIKES = 1e-3
+"""Largest share of spikes; where there are more, they are no accidents."""
+_NYQUIST = 0.9
+_LINGERING = 0.3
+"""Correlation of neighbouring batches above which they are not independent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Synchronous:
+    """The mean over turns.
+
+    Attributes
+    ----------
+    coefficient : ndarray, (batch, 2 K + 1, sensor)
+        a_0, a_1 ... a_K, b_1 ... b_K of each batch, m.
+    level : ndarray, (sensor, batch)
+        a_0 as it changes, m.
+    factor : float
+        For the scatter of the batches: their number is finite, and neighbours may be alike.
+    count : int
+        Samples.
+    limit : ndarray, (sensor,)
+        Of spikes, m.
+    spikes, missing : int
+        Excluded samples, and samples without all readings.
+    notes, doubts : list of str
+    """
+
+    coefficient: Array
+    level: Array
+    factor: float
+    count: int
+    limit: Array
+    spikes: int
+    missing: int
+    notes: list[str]
+    doubts: list[str]
+
+    @property
+    def harmonics(self) -> int:
+        """K."""
+        return int(self.coefficient.shape[1] - 1) // 2
+
+    def at(self, angle: Array) -> Array:
+        """Return the mean without a_0, (sensor, n), m."""
+        return np.asarray(harmonics_at(angle, self.harmonics)[:, 1:] @ self.coefficient.mean(axis=0)[1:]).T
+
+    def scatter_at(self, angle: Array) -> Array:
+        """Return the effects of the batches on the mean, (sensor, n, batch), m."""
+        batches = len(self.coefficient)
+        off = (self.coefficient - self.coefficient.mean(axis=0))[:, 1:]
+        off *= self.factor / np.sqrt(batches * (batches - 1))
+        return np.asarray(harmonics_at(angle, self.harmonics)[:, 1:] @ off).transpose(2, 1, 0)
+
+
+def harmonics_at(angle: Array, count: int, variance: Array | float = 0.0) -> Array:
+    """Return 1, cos k q and sin k q, (n, 2 K + 1), as means over parts with variances of the angle (n,)."""
+    k = np.arange(1, count + 1)
+    part = 1.0 - np.square(k) * np.asarray(variance)[..., None] / 2
+    phase = np.multiply.outer(angle, k)
+    return np.concatenate([np.ones((angle.size, 1)), part * np.cos(phase), part * np.sin(phase)], axis=1)
+
+
+def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronous:
+    """Return the mean over turns of a record, with up to a number of harmonics.
+
+    Raises
+    ------
+    MethodError
+        The samples do not determine it.
+    """
+    sensors = raw.sizes["sensor"]
+    batches = min(BATCHES, turning.turns)
+    each = max(raw.sizes["time"] / turning.turns, 1.0)
+    # Finer than the samples, so that parts do not limit the harmonics
+    parts = int(np.clip(2 ** np.ceil(np.log2(2 * each * (turning.turns // batches))), 16, PARTS))
+    count, total = np.zeros((batches, parts), np.int64), np.zeros((sensors, batches, parts))
+    offset, square = np.zeros((batches, parts)), np.zeros((batches, parts))
+    limit, spikes, before, seen = np.full(sensors, np.inf), 0, np.nan, 0
+    for number, chunk in enumerate(chunks(raw)):
+        angle, before = angles_of(chunk, turning, before)
+        if number == 0:
+            limit = limits(chunk.reading)
+        turn = angle / TAU
+        seen += int(np.count_nonzero((turn >= 0) & (turn < turning.turns)))
+        spikes += add_up(chunk.reading, turn, turning.sense, turning.turns, limit, count, offset, square, total)
+    if not count.any():
+        raise MethodError("displacement: expected samples with readings of all sensors; found none in the whole turns")
+    variance = square / np.maximum(count, 1) - np.square(offset / np.maximum(count, 1))
+    middle = (np.arange(parts) + 0.5 + offset / np.maximum(count, 1)) * TAU / parts
+    means = total / np.maximum(count, 1)
+    return _fitted(
+        count, middle, np.maximum(variance, 0.0) * (TAU / parts) ** 2, means, turning.turns, wanted, limit, spikes, seen
+    )
+
+
+def limits(reading: Array) -> Array:
+    """Return the distance of spikes from their neighbours, (sensor,), m; infinite where they are no accidents."""
+    d = reading[:, 1:-1] - (reading[:, :-2] + reading[:, 2:]) / 2
+    found = np.full(len(reading), np.inf)
+    for i, each in enumerate(d):
+        known = each[np.isfinite(each)]
+        if known.size > 100:
+            limit = SPIKE * float(scale_about_zero(known))
+            if limit > 0 and np.mean(np.abs(known) > limit) < SPIKES:
+                found[i] = limit
+    return found
+
+
+def _fitted(
+    count: NDArray[np.int64],
+    middle: Array,
+    variance: Array,
+    means: Array,
+    turns: int,
+    wanted: int,
+    limit: Array,
+    spikes: int,
+    seen: int,
+) -> Synchronous:
+    """Return the harmonics of all batches whose samples determine them."""
+    gaps = np.array([_gap(middle[b][count[b] > 0]) for b in range(len(count))])
+    usual = float(np.median(gaps))
+    K = min(wanted, int(_NYQUIST * np.pi / usual + 1e-6)) if np.isfinite(usual) else 0
+    if K < 1:
+        raise MethodError(
+            "The samples leave more than half of a turn without readings; expected some ten in each turn."
+        )
+    kept = gaps <= 1.2 * np.pi / K
+    notes, doubts = list[str](), list[str]()
+    if wanted > K:
+        notes.append(
+            f"The samples determine {K} undulations in one turn instead of {wanted}; what is above is no part of the "
+            "synchronous error motion, or folded into it."
+        )
+    if kept.sum() < FEWEST_BATCHES:
+        raise MethodError(
+            f"Only {kept.sum()} of {kept.size} batches of turns have samples over the whole turn; expected "
+            f"{FEWEST_BATCHES} or more."
+        )
+    if not kept.all():
+        notes.append(f"{(~kept).sum()} of {kept.size} batches of turns have gaps and are not used.")
+    found = np.zeros((len(count), 2 * K + 1, len(means)))
+    for b in np.flatnonzero(kept):
+        there = count[b] > 0
+        design = harmonics_at(middle[b, there], K, variance[b, there])
+        weighted = design * count[b, there, None]
+        found[b] = np.linalg.solve(design.T @ weighted, weighted.T @ means[:, b, there].T)
+    used = found[kept]
+    batches = len(used)
+    phi = _lingering(used)
+    if phi > _LINGERING:
+        doubts.append(
+            f"Neighbouring batches of turns are alike (correlation {phi:.2f}): the error motion changes slowly, or "
+            "contains a motion whose frequency nearly is a multiple of the speed. Its uncertainty is increased; a "
+            "longer record separates them."
+        )
+    slow = np.sqrt((1 + phi) / (1 - phi)) if phi > _LINGERING else 1.0
+    level = np.where(kept[:, None], found[:, 0], np.nan)
+    notes += _leftover(used, count[kept], middle[kept], variance[kept], means[:, kept])
+    valid = int(count[kept].sum())
+    missing = seen - int(count.sum()) - spikes
+    if spikes:
+        notes.append(f"{spikes} readings stand out from both neighbours; these samples are not used.")
+    if missing > 0:
+        notes.append(f"{missing} of {seen} samples have no reading of one or more sensors and are not used.")
+    factor = float(expansion(batches - 1)) * float(slow)
+    return Synchronous(
+        used, _levels(level, turns / len(count)), factor, valid, limit, spikes, max(missing, 0), notes, doubts
+    )
+
+
+def _gap(angle: Array) -> float:
+    """Return the largest gap between angles of a turn, rad."""
+    if angle.size < 2:
+        return np.inf
+    ordered = np.sort(angle)
+    return float(np.diff(np.append(ordered, ordered[0] + TAU)).max())
+
+
+def _lingering(coefficient: Array) -> float:
+    """Return the correlation of neighbouring batches, of all harmonics but the eccentricity, 0 to 0.9."""
+    K = (coefficient.shape[1] - 1) // 2
+    rows = [k for k in range(1, 2 * K + 1) if k not in (1, K + 1)]
+    off = coefficient[:, rows] - coefficient[:, rows].mean(axis=0)
+    if len(off) < 8 or not off.any():
+        return 0.0
+    phi = float((off[1:] * off[:-1]).sum() / np.square(off).sum()) + 1.0 / len(off)
+    return float(np.clip(phi, 0.0, 0.9))
+
+
+def _levels(level: Array, turns: float) -> Array:
+    """Return the slow change of the readings, (sensor, batch), m: that of batches of many turns, or a line."""
+    batch = np.arange(len(level))
+    known = np.isfinite(level[:, 0])
+    if turns >= LONG:
+        return np.array([np.interp(batch, batch[known], each[known]) for each in level.T])
+    return np.array([np.polyval(np.polyfit(batch[known], each[known], 1), batch) for each in level.T])
+
+
+def _leftover(used: Array, count: NDArray[np.int64], middle: Array, variance: Array, means: Array) -> list[str]:
+    """Return a note on what repeats from turn to turn and has more undulations than are evaluated."""
+    K, batches = (used.shape[1] - 1) // 2, len(used)
+    groups = 4 * K
+    total, weight = np.zeros((len(means), batches, groups)), np.zeros((batches, groups))
+    for b in range(batches):
+        there = count[b] > 0
+        rest = means[:, b, there] - (harmonics_at(middle[b, there], K, variance[b, there]) @ used[b]).T
+        group = (middle[b, there] % TAU / TAU * groups).astype(int) % groups
+        weight[b] = np.bincount(group, count[b, there], groups)
+        for i, each in enumerate(rest):
+            total[i, b] = np.bincount(group, each * count[b, there], groups)
+    seen = weight > 0
+    number = seen.sum(axis=0)
+    known = number >= FEWEST_BATCHES
+    if known.sum() < groups / 2:
+        return []
+    found = []
+    for i, each in enumerate(total / np.maximum(weight, 1)):
+        mean = each.sum(axis=0) / np.maximum(number, 1)
+        off = np.where(seen, each - mean, 0.0)
+        scatter = np.square(off).sum(axis=0) / np.maximum(number - 1, 1) / np.maximum(number, 1)
+        square, expected = float(np.square(mean[known]).mean()), float(scatter[known].mean())
+        size = np.sqrt(max(square - expected, 0.0))
+        if square > expected * (1 + 8 * np.sqrt(2 / known.sum())) and size > 1e-9:
+            found.append(f"{1e9 * size:.2g} nm (sensor {i + 1})")
+    if not found:
+        return []
+    return [
+        f"Motions with more than {K} undulations in one turn repeat from turn to turn: {', '.join(found)}, root mean "
+        "square. They are no part of the synchronous error motion; increase harmonics."
+    ]
