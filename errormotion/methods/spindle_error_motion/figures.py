@@ -138,7 +138,7 @@ def spread_of(
         if number == 0 and np.isfinite(mean.limit).any():
             place = np.nan_to_num(turning.sense * angle)
             rest = chunk.reading - np.array([np.interp(place % TAU, grid, row) for row in table])
-            limit = np.minimum(limits(rest), mean.limit)
+            limit = np.maximum(np.minimum(limits(rest), mean.limit), 4 * mean.step)
         seed = extremes(
             chunk.reading,
             turn,

@@ -158,7 +158,7 @@ def _problem(record: Record, notes: list[str]) -> Problem:
     gain = stated("gain_uncertainty", 0.0) * np.eye(sensors)[:, None, :]
     noise = stated("displacement_noise", 0.0) * np.sqrt((2 * mean.harmonics + 1) / mean.count)
     level = float(np.sqrt(np.square(scatter).sum(axis=2).mean())) if batches else 0.0
-    sd = max(_SMALL * noise, 1e-3 * level, 1e-15)
+    sd = np.hypot(max(_SMALL * noise, 1e-3 * level, 1e-15), mean.rounded)[sensor]
     return Problem(
         equation=equation,
         readings=y.ravel(),
@@ -201,7 +201,7 @@ def _problem(record: Record, notes: list[str]) -> Problem:
                 group=MOTION,
             ),
         ),
-        noise=Noise(sd=np.full(sensors * n, sd)),
+        noise=Noise(sd=sd),
         reading_scale=1e-4,
     )
 
@@ -254,7 +254,8 @@ def _finished(solved: Solved, *, record: Record) -> Solved:
     if not observed.reliability:
         return solved
     curves, angle = record.curves, record.angle
-    noise = float(record.raw["displacement_noise"])
+    # A range contains the rounding of its two ends
+    noise = float(np.hypot(record.raw["displacement_noise"], record.mean.step.max() / np.sqrt(12)))
     spread = spread_of(record.raw, record.layout, record.turning, record.mean, curves, noise)
     value = np.nan_to_num(errors.value)
     gains, scatter = (np.array([source.group == group for source in errors.sources]) for group in (GAIN, MOTION))

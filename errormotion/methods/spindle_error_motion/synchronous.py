@@ -13,7 +13,7 @@ scatter, with whatever correlation the motion has along the turn and between sen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.resolution import common, step_of
 from errormotion.estimation.robust import scale_about_zero
 from errormotion.estimation.variance import expansion
 from errormotion.methods.spindle_error_motion.averaging import add_up
@@ -32,6 +33,8 @@ PARTS = 1024
 """Most parts of a turn."""
 LONG = 100
 """Turns of a batch from which on its mean is a slow change, not a part of the asynchronous motion."""
+SAMPLE = 20_000
+"""Readings of each sensor from whose differences the step of its scale is found."""
 SPIKE = 8.0
 """Distance of a spike from its neighbours, in robust standard deviations."""
 SPIKES = 1e-3
@@ -59,6 +62,8 @@ class Synchronous:
         Of spikes, m.
     spikes, missing : int
         Excluded samples, and samples without all readings.
+    step, rounded : ndarray, (sensor,)
+        Of the scale of the readings, and what rounding adds to the uncertainty of the mean at an angle, m.
     notes, doubts : list of str
     """
 
@@ -69,6 +74,8 @@ class Synchronous:
     limit: Array
     spikes: int
     missing: int
+    step: Array
+    rounded: Array
     notes: list[str]
     doubts: list[str]
 
@@ -112,11 +119,12 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
     parts = int(np.clip(2 ** np.ceil(np.log2(2 * each * (turning.turns // batches))), 16, PARTS))
     count, total = np.zeros((batches, parts), np.int64), np.zeros((sensors, batches, parts))
     offset, square = np.zeros((batches, parts)), np.zeros((batches, parts))
-    limit, spikes, before, seen = np.full(sensors, np.inf), 0, np.nan, 0
+    limit, step, spikes, before, seen = np.full(sensors, np.inf), np.zeros(sensors), 0, np.nan, 0
     for number, chunk in enumerate(chunks(raw)):
         angle, before = angles_of(chunk, turning, before)
         if number == 0:
-            limit = limits(chunk.reading)
+            step = np.array([step_of(each[:SAMPLE]) for each in chunk.reading])
+            limit = np.maximum(limits(chunk.reading), 4 * step)
         turn = angle / TAU
         seen += int(np.count_nonzero((turn >= 0) & (turn < turning.turns)))
         spikes += add_up(chunk.reading, turn, turning.sense, turning.turns, limit, count, offset, square, total)
@@ -125,9 +133,9 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
     variance = square / np.maximum(count, 1) - np.square(offset / np.maximum(count, 1))
     middle = (np.arange(parts) + 0.5 + offset / np.maximum(count, 1)) * TAU / parts
     means = total / np.maximum(count, 1)
-    return _fitted(
-        count, middle, np.maximum(variance, 0.0) * (TAU / parts) ** 2, means, turning.turns, wanted, limit, spikes, seen
-    )
+    variance = np.maximum(variance, 0.0) * (TAU / parts) ** 2
+    found = _fitted(count, middle, variance, means, turning.turns, wanted, limit, spikes, seen)
+    return _with_rounding(found, step, float(raw["displacement_noise"]), turning.turns)
 
 
 def limits(reading: Array) -> Array:
@@ -201,9 +209,32 @@ def _fitted(
     if missing > 0:
         notes.append(f"{missing} of {seen} samples have no reading of one or more sensors and are not used.")
     factor = float(expansion(batches - 1)) * float(slow)
-    return Synchronous(
-        used, _levels(level, turns / len(count)), factor, valid, limit, spikes, max(missing, 0), notes, doubts
-    )
+    levels, none = _levels(level, turns / len(count)), np.zeros(len(means))
+    return Synchronous(used, levels, factor, valid, limit, spikes, max(missing, 0), none, none, notes, doubts)
+
+
+def _with_rounding(found: Synchronous, step: Array, noise: float, turns: int) -> Synchronous:
+    """Return the mean with what rounding adds: alike in all turns, and independent from angle to angle.
+
+    The scatter from turn to turn, which averages rounding out, is at least the noise of a sensor and the scatter of the
+    batches at one angle. Neighbouring angles are rounded differently, by the eccentricity.
+    """
+    if not step.any():
+        return found
+    batches = len(found.coefficient)
+    scatter = found.coefficient[:, 1:].var(axis=0, ddof=1).sum(axis=0) / 2 * turns / batches
+    before = np.hypot(noise, np.sqrt(scatter))
+    alike = np.array([float(common(float(q), s)) for q, s in zip(step, before, strict=True)])
+    each = max(found.count / turns, 1.0)  # samples in a turn
+    rounded = alike * np.sqrt(np.minimum((2 * found.harmonics + 1) / each, 1.0))
+    notes = list(found.notes)
+    if (alike > 0.1 * step).any():
+        words = ", ".join(f"sensor {i + 1} by {1e9 * q:.3g} nm" for i, q in enumerate(step) if q > 0)
+        notes.append(
+            f"The readings are rounded ({words}), with less motion from turn to turn than that: rounding is a part of "
+            "the uncertainties."
+        )
+    return replace(found, step=step, rounded=rounded, notes=notes)
 
 
 def _gap(angle: Array) -> float:

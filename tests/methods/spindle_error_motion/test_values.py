@@ -189,3 +189,20 @@ def test_harmonics_of_means_over_parts_are_not_reduced():
     design = synchronous.harmonics_at(middle, 16, np.full(parts, width**2 / 12))
     found = np.linalg.lstsq(design, means, rcond=None)[0]
     assert found[k] == pytest.approx(1.0, abs=(k * width) ** 4 / 1920 * 1.2)
+
+
+@pytest.mark.parametrize("per_turn", [200.0, 179.37])
+def test_rounded_readings_are_inside_their_uncertainty(recorded, per_turn):
+    """With a step of 100 nm and samples at the same angles in all turns, these are rounded alike."""
+    raw = recorded(lambda q: A * np.cos(2 * q), per_turn=per_turn, noise=1e-9)
+    q = 100e-9
+    raw["displacement"] = (np.rint(raw["displacement"] / q) * q).assign_attrs(units="m")
+    errors, of = evaluated(raw)
+    off = errors["EX"].values - A * np.cos(2 * errors["angle"].values)
+    u = np.sqrt(errors["covariance"].values[:, 0, 0])
+    assert 0.5e-9 < np.sqrt(np.mean(off**2)) < 1.5 * np.sqrt(np.mean(u**2))
+    assert np.mean(np.abs(off) < 2 * u) > 0.9
+    if per_turn == 200.0:  # else each turn is rounded at other angles, and the scatter shows it
+        assert any("rounded" in note for note in errors.attrs["notes"])
+    [figure] = [each for each in SpindleErrorMotion.figures(errors) if each.name == "asynchronous radial, fixed X"]
+    assert abs(of[figure.name]) <= figure.expanded_uncertainty + 2 * q / np.sqrt(12)
