@@ -1,7 +1,7 @@
 """Sphinx settings: MyST pages, furo, API pages from the numpy-style docstrings."""
 
-import importlib.util
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -73,18 +73,20 @@ def _title_only(contents: nodes.bullet_list) -> nodes.bullet_list:
     return title
 
 
-def _append_error_codes(app: Sphinx, page: str, source: list[str]) -> None:
-    """Append the list of codes, which is made from the source of the package, to its page."""
+MADE = {"reference/error-codes": "error_codes", "reference/source-groups": "source_groups"}
+"""Pages that end with a list, and the module of ``tools`` that makes it from the source of the package."""
+
+
+def _append_list(app: Sphinx, page: str, source: list[str]) -> None:
+    """Append the list of a page that is made from the source of the package."""
     del app
-    if page == "reference/error-codes":
-        spec = importlib.util.spec_from_file_location("error_codes", Path(__file__).parents[1] / "tools/error_codes.py")
-        tool = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(tool)
-        source[0] += "\n" + tool.table(tool.Source())
+    if page in MADE:
+        path = Path(__file__).parents[1] / "tools" / f"{MADE[page]}.py"
+        source[0] += "\n" + runpy.run_path(str(path))["table"]()
 
 
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
-    app.connect("source-read", _append_error_codes)
+    app.connect("source-read", _append_list)
     app.connect("autodoc-process-docstring", _escape_second_dims)
     app.connect("html-page-context", _make_navigation_of_titles, priority=400)  # before the theme's

@@ -23,6 +23,7 @@ same. The exit code is 1 if anything differs, or if an item is in only one folde
 With ``--within``, a difference is divided by the standard uncertainty: from ``covariance`` (EX to EC, ``covariance``,
 ``influence``), from ``NAME_uncertainty`` or ``NAME_covariance`` (other variables), or, without a stated one, by the
 largest absolute value of the variable. Integers, truth values, texts and the pattern of NaN must always be equal.
+Earlier names of groups of sources equal the present ones.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ import hashlib
 import json
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -47,6 +49,9 @@ import numpy as np
 import xarray as xr
 
 SEEDS = (0, 1, 2)
+TABLE_OF_GROUPS = Path(__file__).parents[1] / "errormotion" / "datasets" / "groups.py"
+GROUPS: dict[str, str] = {}
+"""Earlier names of groups of sources, and the present ones; read when they are needed."""
 CAMPAIGNS = (
     *("virtual_cframe/campaign", "virtual_beam/campaign", "virtual_tracker/campaign", "virtual_gantry/campaign"),
     *("virtual_probing/monday", "virtual_probing/tuesday", "virtual_probing/friday"),
@@ -307,6 +312,11 @@ class Difference:
 
     def _variable(self, name: str, old: xr.Dataset, new: xr.Dataset) -> None:
         a, b = old.variables[name], new.variables[name]
+        if name == "source_group":
+            before, after = ([present_group(str(each)) for each in v.values] for v in (a, b))
+            if before != after:
+                self.found.append(f"{name}: {sorted(set(before))} became {sorted(set(after))}")
+            return
         if (a.dims, a.shape, a.dtype) != (b.dims, b.shape, b.dtype):
             self.found.append(f"{name}: {a.dims} {a.shape} {a.dtype} became {b.dims} {b.shape} {b.dtype}")
             return
@@ -346,6 +356,13 @@ class Difference:
 
     def _close(self, a: float, b: float) -> bool:
         return (a != a and b != b) or (self.within is not None and abs(a - b) <= self.within * max(abs(a), abs(b)))
+
+
+def present_group(name: str) -> str:
+    """Return the present name of a group of sources; the table of the source tree, which needs no installation."""
+    if not GROUPS:
+        GROUPS.update(runpy.run_path(str(TABLE_OF_GROUPS))["ALIASES"])
+    return GROUPS.get(name, name)
 
 
 def uncertainty(name: str, ds: xr.Dataset) -> Any:

@@ -163,8 +163,9 @@ def _codes(value: ast.expr) -> list[str]:
     return [text for text in texts if isinstance(text, str) and FORM.fullmatch(text)]
 
 
-def table(source: Source) -> str:
+def table(source: Source | None = None) -> str:
     """Return the list of codes as Markdown, a section for each area."""
+    source = Source() if source is None else source
     found: dict[str, list[Site]] = {}
     for site in sites(source):
         found.setdefault(site.code, []).append(site)
@@ -185,4 +186,4 @@ def _cell(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(table(Source()))
+    sys.stdout.write(table())

@@ -119,6 +119,15 @@ def test_another_wording_is_accepted_only_with_the_same_numbers(tmp_path: Path, 
     assert compared(old, new, wording=True)[0] == code
 
 
+def test_an_earlier_name_of_a_group_of_sources_is_the_present_one(tmp_path: Path) -> None:
+    def stored(name: str, groups: list[str]) -> Path:
+        return store(tmp_path / name, errors().assign_coords(source_group=("source", groups)))
+
+    old = stored("old", ["air", "stations"])
+    assert compared(old, stored("new", ["refraction", "stations"]))[0] == 0
+    assert compared(old, stored("other", ["refraction", "scales"]))[0] == 1
+
+
 def test_a_missing_dataset_and_another_input_are_differences(tmp_path: Path) -> None:
     old, new = store(tmp_path / "old", errors()), store(tmp_path / "new", errors())
     (new / "digests.json").write_text((new / "digests.json").read_text().replace('"0"', '"1"'))

@@ -19,6 +19,7 @@ from errormotion.datasets.files.containers import MUCH, check_classic, check_net
 from errormotion.datasets.files.hdf5 import WIDTH
 from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import reason, replace_bytes, whole_folder, writing
+from errormotion.datasets.groups import with_present_groups
 from errormotion.datasets.schemas import SCHEMA
 from errormotion.datasets.storage.compression import as_stored, encoding
 from errormotion.datasets.storage.netcdf import compose_netcdf, open_netcdf
@@ -38,9 +39,9 @@ _MAX_INDEX = 100_000
 def load(path: str | Path) -> xr.Dataset:
     """Open a dataset.
 
-    An error dataset is read into memory. Values of a raw dataset are read when they are used; a long ``time`` has
-    no index, and evenly spaced times are not stored: they follow from the attributes ``sample_rate`` (Hz) and
-    ``time_start`` (s, 0 if missing).
+    An error dataset is read into memory, and its groups of sources get their present names. Values of a raw dataset
+    are read when they are used; a long ``time`` has no index, and evenly spaced times are not stored: they follow
+    from the attributes ``sample_rate`` (Hz) and ``time_start`` (s, 0 if missing).
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def load(path: str | Path) -> xr.Dataset:
         ds = _tidy(ds)
         if ds.attrs.get("schema") == SCHEMA:
             with ds:
-                ds = ds.load()
+                ds = with_present_groups(ds.load())
         return _with_indexes(ds)
 
 
