@@ -15,7 +15,7 @@ from errormotion.datasets.results.reduction import influence_of
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.errors import DatasetError
 from errormotion.kinematics.chains import parse_chain
-from errormotion.kinematics.twists import cross_matrix
+from errormotion.kinematics.twists import rigid_motions
 
 _AXES = "XYZ"
 
@@ -105,9 +105,7 @@ class Field:
         n = len(positions)
         own = weights.squared(self.own)
         own[:, range(6), range(6)] += np.where(self.known, self._added(positions, time), 0.0)
-        L = np.zeros((n, 3, 6))
-        L[:, :, :3] = np.eye(3)
-        L[:, :, 3:] = -cross_matrix(self.lever + self.travel * positions)
+        L = rigid_motions(self.lever + self.travel * positions, np.zeros(3))
         effects = [weights.of(each) for each in self.influence]
         moved = np.array([np.einsum("nij,nj->ni", L, each) for each in effects]).reshape(-1, n, 3)
         return L @ own @ np.swapaxes(L, 1, 2), moved
