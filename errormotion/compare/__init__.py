@@ -10,10 +10,10 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
+from errormotion.compare.comparable import ComparableErrors, comparable_errors
 from errormotion.compare.consensus import consensus, random_effects
 from errormotion.compare.diagnosis import Cause, diagnose
-from errormotion.compare.diagnosis.shift import course_of
-from errormotion.compare.ground import Ground, common_ground
+from errormotion.compare.diagnosis.shift import curves_of
 from errormotion.compare.pairs import pair
 from errormotion.compare.repeats import repeats
 from errormotion.compare.result import build
@@ -46,7 +46,7 @@ def compare(
     datasets : mapping of str to Dataset
         Name to error dataset; at least two.
     at, freedoms, since, same_start
-        As for `errormotion.compare.ground.common_ground`.
+        As for `errormotion.compare.comparable.comparable_errors`.
     causes : bool, optional
         Whether causes are searched. Default: for pairs that do not agree; not for repeats (``groups``).
     against : str, optional
@@ -71,28 +71,28 @@ def compare(
         datasets = {name: ds.copy() for name, ds in datasets.items()}
         for ds in datasets.values():
             ds.attrs.pop("start", None)
-    ground = common_ground(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
-    pairs = [pair(a, b) for a, b in _pairs(ground, against)]
-    by_name = {each.name: each for each in ground.estimates}
+    common = comparable_errors(datasets, at=at, freedoms=freedoms, since=since, same_start=same_start)
+    pairs = [pair(a, b) for a, b in _pairs(common, against)]
+    by_name = {each.name: each for each in common.estimates}
     found: list[list[Cause] | None] = []
     for each in pairs:
         wanted = groups is None and each.joint.p < DISAGREEMENT_P / len(pairs) if causes is None else causes
-        found.append(explain(by_name[each.a], by_name[each.b], datasets, ground) if wanted else None)
-    spread = repeats(ground.estimates, [groups[each.name] for each in ground.estimates]) if groups else None
-    return build(ground, pairs, consensus(ground.estimates), random_effects(ground.estimates), found, spread)
+        found.append(explain(by_name[each.a], by_name[each.b], datasets, common) if wanted else None)
+    spread = repeats(common.estimates, [groups[each.name] for each in common.estimates]) if groups else None
+    return build(common, pairs, consensus(common.estimates), random_effects(common.estimates), found, spread)
 
 
-def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], ground: Ground) -> list[Cause]:
+def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], common: ComparableErrors) -> list[Cause]:
     """Return the causes of the difference of two estimates on common ground that are more likely than chance."""
-    time = np.asarray(ground.coords["time"].values, dtype=float) if ground.dim == "time" else None
-    records = {each.name: ground.records[each.name] for each in (a, b) if each.name in ground.records}
-    courses = {name: course for name, ds in records.items() if (course := course_of(ds, ground.freedoms))}
-    heat = _temperatures(datasets, ground)
-    return diagnose(a, b, ground.freedoms, ground.stored, time=time, temperatures=heat, courses=courses)
+    time = np.asarray(common.coords["time"].values, dtype=float) if common.dim == "time" else None
+    records = {each.name: common.records[each.name] for each in (a, b) if each.name in common.records}
+    smoothed = {name: found for name, ds in records.items() if (found := curves_of(ds, common.freedoms))}
+    temperatures = _temperatures(datasets, common)
+    return diagnose(a, b, common.freedoms, common.stored, time=time, temperatures=temperatures, curves=smoothed)
 
 
-def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
-    estimates = ground.estimates
+def _pairs(common: ComparableErrors, against: str) -> list[tuple[Estimate, Estimate]]:
+    estimates = common.estimates
     if against and against not in (names := [each.name for each in estimates]):
         raise DatasetError(
             f"against: expected one of the datasets {', '.join(names)}; found '{against}'",
@@ -100,25 +100,25 @@ def _pairs(ground: Ground, against: str) -> list[tuple[Estimate, Estimate]]:
         )
     if not against and len(estimates) > MAX_FOR_ALL_PAIRS:
         against = estimates[0].name
-        ground.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
+        common.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
     if not against:
         return list(combinations(estimates, 2))
     first = next(each for each in estimates if each.name == against)
     return [(first, each) for each in estimates if each is not first]
 
 
-def _temperatures(datasets: Mapping[str, xr.Dataset], ground: Ground) -> dict[str, Array]:
+def _temperatures(datasets: Mapping[str, xr.Dataset], common: ComparableErrors) -> dict[str, Array]:
     """Return the recorded temperatures of all datasets at the times of the grid, by name."""
-    if ground.dim != "time":
+    if common.dim != "time":
         return {}
     from errormotion.datasets.timing import between
 
-    grid, found = np.asarray(ground.coords["time"].values, dtype=float), {}
+    grid, found = np.asarray(common.coords["time"].values, dtype=float), {}
     for name, ds in datasets.items():
         if "temperature" not in ds.coords or "time" not in ds["temperature"].dims:
             continue
         start = str(ds.attrs.get("start", ""))
-        t = ds["time"].values + (between(ground.start, start) if start and ground.start else 0.0)
+        t = ds["time"].values + (between(common.start, start) if start and common.start else 0.0)
         temperature = ds["temperature"].transpose("time", ...).values.reshape(len(t), -1)
         labels = [str(each) for each in ds["sensor"].values] if "sensor" in ds.coords else [""]
         for k, label in enumerate(labels[: temperature.shape[1]]):

@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
+from errormotion.compare.comparable import ComparableErrors
 from errormotion.compare.consensus import Consensus
 from errormotion.compare.diagnosis import Cause
-from errormotion.compare.ground import Ground
 from errormotion.compare.pairs import Pair
 from errormotion.compare.repeats import KINDS, Repeats
 from errormotion.compare.stack import shared
@@ -73,7 +73,7 @@ REPEATS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def build(
-    ground: Ground,
+    common: ComparableErrors,
     pairs: Sequence[Pair],
     agreed: Consensus,
     robust: tuple[Array, Array, Array],
@@ -81,7 +81,7 @@ def build(
     spread: Repeats | None = None,
 ) -> xr.Dataset:
     """Return the result of a comparison as a dataset of the schema; ``causes`` of a pair are None if not searched."""
-    estimates = ground.estimates
+    estimates = common.estimates
     found: dict[str, Any] = {
         "value": np.array([each.value for each in estimates]),
         "covariance": np.array([each.covariance() for each in estimates]),
@@ -103,13 +103,13 @@ def build(
         "rest_p": np.array([each.p for each in agreed.rest]),
         **_causes([each or () for each in causes]),
     }
-    single = not ground.dim
+    single = not common.dim
     variables = {}
     for name, (dims, meaning) in TABLE.items():
         values = found[name]
         if "..." in dims and single:
             values = np.take(values, 0, axis=dims.index("..."))
-        names = [ground.dim if dim == "..." else dim for dim in dims if not (dim == "..." and single)]
+        names = [common.dim if dim == "..." else dim for dim in dims if not (dim == "..." and single)]
         variables[name] = (names, values, {"long_name": meaning})
     if spread is not None:
         groups = {f"spread{end}": getattr(spread, name) for end, name in _SPREAD.items()}
@@ -119,28 +119,28 @@ def build(
         **({"kind": list(KINDS)} if spread is not None else {}),
         "dataset": [each.name for each in estimates],
         "pair": [f"{each.a} - {each.b}" for each in pairs],
-        "dof": list(ground.freedoms),
-        "dof_": list(ground.freedoms),
+        "dof": list(common.freedoms),
+        "dof_": list(common.freedoms),
         "rank": np.arange(1, CAUSES + 1),
-        **ground.coords,
+        **common.coords,
     }
     attrs: dict[str, Any] = {
         "schema": SCHEMA,
-        "component": ground.component,
-        "machine": ground.machine,
-        "frame": ground.frame,
-        "functional_point": ground.point,
+        "component": common.component,
+        "machine": common.machine,
+        "frame": common.frame,
+        "functional_point": common.point,
         "fit_chi2": agreed.fit.value,
         "fit_degrees": agreed.fit.degrees,
         "fit_p": agreed.fit.p,
         "birge_ratio": agreed.birge,
         "shared_sources": json.dumps(shared(estimates)),
-        "shared_names": json.dumps([ground.labels.get(key, key) for key in shared(estimates)]),
-        "notes": ground.notes or [""],
+        "shared_names": json.dumps([common.labels.get(key, key) for key in shared(estimates)]),
+        "notes": common.notes or [""],
         "searched": np.array([each is not None for each in causes], dtype=int),
     }
-    if ground.since is not None:
-        attrs |= {"since": ground.since, "start": ground.start}
+    if common.since is not None:
+        attrs |= {"since": common.since, "start": common.start}
     ds = xr.Dataset(variables, coords=coords, attrs=attrs)
     if wrong := violations(ds):
         raise DatasetError(f"The result of the comparison does not conform to {SCHEMA}:", wrong, code="schema.violated")

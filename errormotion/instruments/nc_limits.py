@@ -10,7 +10,7 @@ refused: their path depends on the state of the control.
 from __future__ import annotations
 
 from errormotion.errors import InstrumentError, ProgramError
-from errormotion.instruments.door import Door
+from errormotion.instruments.interlock import Interlock
 from errormotion.instruments.nc_words import COMMENT, printing, split
 
 MAX_CHARACTERS = 1 << 24
@@ -21,7 +21,7 @@ _SWITCHES = {"0", "1", "2", "3", "4", "5", "6", "7", "8", "9", "30"}
 _MM, _MM_MIN = 1e-3, 1e-3 / 60  # m, m/s
 
 
-def check_program(text: str, door: Door) -> None:
+def check_program(text: str, interlock: Interlock) -> None:
     """Check that a program stays within the limits of the bench.
 
     Raises
@@ -35,7 +35,7 @@ def check_program(text: str, door: Door) -> None:
             f"expected a program of at most {MAX_CHARACTERS} characters; found {len(text)}",
             code="motion.program.too_long",
         )
-    limits = door.limits
+    limits = interlock.limits
     if not limits.spans and limits.feed is None and limits.spindle_speed is None:
         return
     stated: set[str] = set()
@@ -43,7 +43,7 @@ def check_program(text: str, door: Door) -> None:
         if COMMENT.sub("", line).strip() in ("", "%") or printing(line):
             continue
         try:
-            _check_line(_words(number, line), door, stated)
+            _check_line(_words(number, line), interlock, stated)
         except InstrumentError as error:
             raise InstrumentError(
                 f"line {number} '{line.strip()[:60]}' of the program: {error}", code=error.code
@@ -60,7 +60,7 @@ def _words(number: int, line: str) -> list[tuple[str, str]]:
     return [(letter, value) for letter, value, _ in block.words]
 
 
-def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> None:
+def _check_line(words: list[tuple[str, str]], interlock: Interlock, stated: set[str]) -> None:
     codes = {f"{letter}{float(value):g}" for letter, value in words}
     dwell = "G4" in codes
     for letter, value in words:
@@ -77,18 +77,18 @@ def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> N
                 "a dwell with other words on its line; write G4 P alone on a line", code="motion.program.dwell"
             )
         return
-    if door.limits.feed is not None and "G0" in codes:
+    if interlock.limits.feed is not None and "G0" in codes:
         raise InstrumentError(
             "a rapid move at the feed of the machine; write G1 with a feed within the limit",
             code="motion.program.rapid",
         )
-    if door.limits.feed is not None and any(letter == "F" for letter, _ in words) and not {"G21", "G94"} <= stated:
+    if interlock.limits.feed is not None and any(letter == "F" for letter, _ in words) and not {"G21", "G94"} <= stated:
         raise InstrumentError(
             "a feed F before a line with G21 and G94; whether it is within the limit is unknown",
             code="motion.program.feed_unknown",
         )
     stated |= {letter for letter, _ in words if letter in "FS"} | {code for code in codes if code[0] == "G"}
-    if door.limits.spindle_speed is not None and {"M3", "M4"} & codes and "S" not in stated:
+    if interlock.limits.spindle_speed is not None and {"M3", "M4"} & codes and "S" not in stated:
         raise InstrumentError(
             "the spindle is started before a speed S; whether it is within the limit is unknown",
             code="motion.program.speed_unknown",
@@ -104,16 +104,16 @@ def _check_line(words: list[tuple[str, str]], door: Door, stated: set[str]) -> N
                 raise InstrumentError(
                     "a position before G0 or G1; the path of the machine is unknown", code="motion.program.move_unknown"
                 )
-            if door.limits.feed is not None and "F" not in stated:
+            if interlock.limits.feed is not None and "F" not in stated:
                 raise InstrumentError(
                     "a move before a feed F; whether it is within the limit is unknown",
                     code="motion.program.feed_unknown",
                 )
-            door.coordinate(letter, float(value) * _MM)
+            interlock.coordinate(letter, float(value) * _MM)
         elif letter == "F":
-            door.feed(float(value) * _MM_MIN)
+            interlock.feed(float(value) * _MM_MIN)
         elif letter == "S":
-            door.speed(float(value))
+            interlock.speed(float(value))
 
 
 def _unknown(what: str) -> InstrumentError:

@@ -110,7 +110,7 @@ def rotating_bar(
     rate: float,
     times: Array,
     slow: Array,
-    turns: Array,
+    revolutions: Array,
     table: Array,
     noise: Array,
     keys: NDArray[np.uint64],
@@ -126,8 +126,8 @@ def rotating_bar(
         Node times, s.
     slow : ndarray, (channel, node)
         Distance at each node, m; linear between.
-    turns : ndarray, (node, 3)
-        Angle of the spindle after node k: turns[k] @ (1, dt, dt^2), in turns.
+    revolutions : ndarray, (node, 3)
+        Angle of the spindle after node k: revolutions[k] @ (1, dt, dt^2), in revolutions.
     table : ndarray, (channel, angle + 1)
         The pattern that repeats in every turn, m, over one turn; the last column repeats the first.
     noise : ndarray, (channel,)
@@ -147,13 +147,13 @@ def rotating_bar(
         for c in range(out.shape[0]):
             value = slow[c, k]
             slope = (slow[c, k + 1] - value) / length
-            turns_0, turns_1, turns_2 = turns[k, 0], turns[k, 1], turns[k, 2]
+            revolutions_0, revolutions_1, revolutions_2 = revolutions[k, 0], revolutions[k, 1], revolutions[k, 2]
             track = table[c]
             key = keys[c]
             sigma = noise[c]
             for i in range(start, stop):
                 dt = (first + i) / rate - t0
-                turn = turns_0 + dt * (turns_1 + dt * turns_2)
+                turn = revolutions_0 + dt * (revolutions_1 + dt * revolutions_2)
                 place = (turn - math.floor(turn)) * angles
                 cell = min(int(place), angles - 1)
                 pattern = track[cell] + (place - cell) * (track[cell + 1] - track[cell])

@@ -19,13 +19,13 @@ from errormotion.twin import truth
 from errormotion.twin.artefacts import bar as bars
 from errormotion.twin.crossbeam import Crossbeam, seeded_crossbeam
 from errormotion.twin.geometry import GeometricErrors, seeded_errors
-from errormotion.twin.heat.state import ThermalState, seeded_state
 from errormotion.twin.kinds import machine_kind
 from errormotion.twin.schedule import Event, Schedule, StepProgram
 from errormotion.twin.sensors import frame as frames
 from errormotion.twin.sensors.probing import ProbeMeasurements
 from errormotion.twin.sensors.sensing import Sensing
 from errormotion.twin.sensors.stage_sensor import StageSensor
+from errormotion.twin.thermal.state import ThermalState, seeded_state
 
 #: Time to full spindle speed, s.
 SPIN_UP_TIME = 0.75

@@ -118,7 +118,7 @@ class Schedule:
     ----------
     events : sequence of Event
     spin_up : float
-        Acceleration of the spindle, turns / s^2.
+        Acceleration of the spindle, revolutions / s^2.
     top_speed : float
         Highest spindle speed, 1/min.
     """
@@ -129,7 +129,7 @@ class Schedule:
     #: times, s, and values (1/min) of commanded speeds; the first is (0, 0) or an event at 0
     speed_times: Array = field(init=False, repr=False)
     speeds: Array = field(init=False, repr=False)
-    #: times of the spindle's phases, and (turns, turns/s, turns/s^2 / 2) at their start
+    #: times of the spindle's phases, and (revolutions, 1/s, 1/s^2 / 2) at their start
     phase_times: Array = field(init=False, repr=False)
     phases: Array = field(init=False, repr=False)
 
@@ -168,37 +168,37 @@ class Schedule:
         for time, speed in zip(self.speed_times, self.speeds / 60, strict=True):
             while times[-1] > time:  # a change of speed during an acceleration
                 del times[-1], phases[-1]
-            turns, rate = self._after(times[-1], phases[-1], time)
+            revolutions, rate = self._after(times[-1], phases[-1], time)
             if times[-1] == time:
                 del times[-1], phases[-1]
             acceleration = np.copysign(self.spin_up, speed - rate)
             ramp = (speed - rate) / acceleration
             if ramp > 0:
                 times.append(float(time))
-                phases.append((turns, rate, acceleration / 2))
-                turns += ramp * (rate + speed) / 2
+                phases.append((revolutions, rate, acceleration / 2))
+                revolutions += ramp * (rate + speed) / 2
             times.append(float(time + ramp))
-            phases.append((turns, float(speed), 0.0))
+            phases.append((revolutions, float(speed), 0.0))
         object.__setattr__(self, "phase_times", np.array(times))
         object.__setattr__(self, "phases", np.array(phases))
 
     @staticmethod
     def _after(begin: float, phase: tuple[float, float, float], time: float) -> tuple[float, float]:
-        turns, rate, half = phase
+        revolutions, rate, half = phase
         dt = time - begin
-        return turns + dt * (rate + dt * half), rate + 2 * dt * half
+        return revolutions + dt * (rate + dt * half), rate + 2 * dt * half
 
     def turning(self, t: ArrayLike) -> Array:
-        """Return (turns, turns/s, half the acceleration) at times t, shape (n, 3)."""
-        turns, rate, half, dt = self._phase(t)
-        return np.stack([turns + dt * (rate + dt * half), rate + 2 * dt * half, half], axis=-1)
+        """Return (revolutions, 1/s, half the acceleration) at times t, shape (n, 3)."""
+        revolutions, rate, half, dt = self._phase(t)
+        return np.stack([revolutions + dt * (rate + dt * half), rate + 2 * dt * half, half], axis=-1)
 
     def _phase(self, t: ArrayLike) -> tuple[Array, Array, Array, Array]:
-        """Return (turns, turns/s, half the acceleration) at the start of the phase at times t, and the time since."""
+        """Return (revolutions, 1/s, half the acceleration) at the start of the phase at times t, and the time since."""
         t = np.asarray(t, dtype=float)
         at = np.maximum(self.phase_times.searchsorted(t, side="right") - 1, 0)
-        turns, rate, half = self.phases[at].T
-        return turns, rate, half, np.asarray(t - self.phase_times[at])
+        revolutions, rate, half = self.phases[at].T
+        return revolutions, rate, half, np.asarray(t - self.phase_times[at])
 
     def speed(self, t: ArrayLike) -> Array:
         """Return the spindle's true speed at times t, 1/min, shape (n,)."""

@@ -42,7 +42,7 @@ class Target:
     position: float
 
     @property
-    def reach(self) -> tuple[float, float]:
+    def span(self) -> tuple[float, float]:
         """Lowest and highest position of the axis at which the profiler may measure it, m."""
         half = self.artefact.half_size[1] + SCAN_MARGIN
         return self.position - half, self.position + half
@@ -66,8 +66,8 @@ class Table:
     def __post_init__(self) -> None:
         ordered = sorted(self.targets, key=lambda target: target.position)
         for one, other in pairwise(ordered):
-            if one.reach[1] > other.reach[0]:
-                apart = one.reach[1] - one.position + other.position - other.reach[0]
+            if one.span[1] > other.span[0]:
+                apart = one.span[1] - one.position + other.position - other.span[0]
                 raise BenchError(
                     f"expected pieces {apart * 1e3:.0f} mm or more apart along Y; found {one.artefact.name} at "
                     f"{one.position:g} m and {other.artefact.name} at {other.position:g} m",
@@ -79,7 +79,7 @@ class Table:
         """Yield slices of increasing positions (n,) of the axis in order, each with its piece, None without one."""
         first = 0
         for target in self.targets:
-            start, end = (int(index) for index in np.searchsorted(y, target.reach))
+            start, end = (int(index) for index in np.searchsorted(y, target.span))
             if first < start:
                 yield slice(first, start), None
             if start < end:

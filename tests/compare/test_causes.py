@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from errormotion import datasets
 from errormotion.compare import compare
-from errormotion.compare.placed import Placed, Stored
+from errormotion.compare.point_errors import PointErrors, Stored
 from errormotion.compare.report import part
 from errormotion.compare.text import cause_text, verdict
 from errormotion.datasets import DOF
@@ -187,7 +187,7 @@ def test_points_without_a_known_value_are_unknown_and_not_0(contradiction):
 @pytest.mark.parametrize("unknown", [(), (1,), (1, 5)])
 def test_one_matrix_for_all_points_is_the_same_as_one_at_each_point(unknown):
     """An unknown rotation is 0 at a lever, and makes the freedoms unknown that it replaces."""
-    each = Placed.of(made("a", np.random.default_rng(9)))
+    each = PointErrors.of(made("a", np.random.default_rng(9)))
     each.value[4, list(unknown)] = each.own[4, list(unknown)] = each.own[4, :, list(unknown)] = np.nan
     turn = Rotation.from_rotvec([0.1, -0.2, 0.05])
     for A in (factor(("EB",), -1.0), swapped(1, 2), twists.adjoint(shift=[0.1, 0.2, -0.3]), twists.adjoint(turn)):

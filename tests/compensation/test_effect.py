@@ -141,7 +141,7 @@ def test_a_result_may_state_references_without_identities() -> None:
 
 def test_results_of_different_days_have_a_common_time_0() -> None:
     found = effect(warm_up(30), warm_up(3, start=LATER))
-    assert found.ground.estimates[1].value.shape == found.ground.estimates[0].value.shape == (13, 6)
+    assert found.common.estimates[1].value.shape == found.common.estimates[0].value.shape == (13, 6)
     assert found.part(DISPLACEMENT).reduction.value == pytest.approx(0.9, abs=0.01)
     assert found.part("EB").reduction.value == pytest.approx(0.0, abs=0.01)
 

@@ -12,7 +12,7 @@ import pytest
 
 from errormotion import plugins
 from errormotion.errors import InstrumentError
-from errormotion.instruments.door import Door
+from errormotion.instruments.interlock import Interlock
 from errormotion.instruments.nc_limits import check_program
 from errormotion.plugins import InstrumentInfo, MachineLimits, PluginSettings, Touch
 from errormotion.plugins.kind_registry import changes_machine, deviations, kind, kind_changes_machine
@@ -22,7 +22,19 @@ DRIVERS = [
     for each in plugins.available("instruments")
     if each.distribution.startswith("errormotion ") and changes_machine(plugins.get("instruments", each.id))
 ]
-READING = {"open", "close", "identify", "configure", "bound", "read", "state", "snapshot", "conformance", "pretravel"}
+READING = {
+    "open",
+    "answer_line",
+    "close",
+    "identify",
+    "configure",
+    "bound",
+    "read",
+    "state",
+    "snapshot",
+    "conformance",
+    "pretravel",
+}
 """Methods of which none sends an order."""
 ALWAYS = {"stop", "estop", "press_estop", "elapse", "finish", "resynchronise", "exchange"}
 """Methods that are allowed without arm: what stops a machine, waits, or has no effect by itself."""
@@ -167,8 +179,8 @@ def test_a_probe_passes_the_limits_on_to_its_controller() -> None:
 LIMITS = MachineLimits({"X": (0.0, 0.1)}, feed=0.02, spindle_speed=1000.0)
 
 
-def door(limits: MachineLimits = LIMITS) -> Door:
-    made = Door("test", "here")
+def interlock(limits: MachineLimits = LIMITS) -> Interlock:
+    made = Interlock("test", "here")
     made.limits = limits
     return made
 
@@ -182,7 +194,7 @@ def door(limits: MachineLimits = LIMITS) -> Door:
     ],
 )
 def test_a_program_within_the_limits_is_accepted(text: str) -> None:
-    check_program(text, door())
+    check_program(text, interlock())
 
 
 @pytest.mark.parametrize(
@@ -226,15 +238,15 @@ def test_a_program_within_the_limits_is_accepted(text: str) -> None:
 )
 def test_a_program_outside_the_limits_or_of_unknown_path_is_refused(text: str, said: str) -> None:
     with pytest.raises(InstrumentError, match=said):
-        check_program(text, door())
-    check_program(text, door(MachineLimits()))  # without limits the control decides
+        check_program(text, interlock())
+    check_program(text, interlock(MachineLimits()))  # without limits the control decides
 
 
 def test_the_first_command_is_stated_before_it_is_sent(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    here = door()
-    here.admit(True, "move to X 1")
-    here.admit(True, "move to X 2")
+    here = interlock()
+    here.require_armed(True, "move to X 1")
+    here.require_armed(True, "move to X 2")
     (record,) = caplog.records
     assert "test at here is armed (X 0 to 100 mm, feed up to 1200 mm/min, spindle up to 1000 /min)" in record.message
     assert "its first command: move to X 1" in record.message

@@ -35,7 +35,7 @@ from errormotion.datasets.units import KINDS, convert
 from errormotion.datasets.validation import validate
 from errormotion.errors import ErrormotionError
 from errormotion.instruments.controller.linuxcnc import bridge
-from errormotion.instruments.door import Door
+from errormotion.instruments.interlock import Interlock
 from errormotion.instruments.line_profiler.profile_files.readers import check_complete, read_scan
 from errormotion.instruments.line_profiler.profile_files.settings import ProfileFileSettings
 from errormotion.instruments.nc_limits import check_program
@@ -245,12 +245,12 @@ def run_indices() -> Sequence[bytes]:
 
 
 def program(content: str) -> None:
-    """Read a program as the door of a controller and the simulated control do."""
+    """Read a program as the interlock of a controller and the simulated control do."""
     title(content)
     errors = []
-    door = Door("a controller", "sim://cframe")
-    door.limits = MachineLimits(TRAVEL, None, 5000.0)
-    for read in (lambda: check_program(content, door), lambda: interpret(content, (0.0, 0.0, 0.0), TRAVEL, 0.5)):
+    interlock = Interlock("a controller", "sim://cframe")
+    interlock.limits = MachineLimits(TRAVEL, None, 5000.0)
+    for read in (lambda: check_program(content, interlock), lambda: interpret(content, (0.0, 0.0, 0.0), TRAVEL, 0.5)):
         try:
             read()
         except ErrormotionError as error:

@@ -45,7 +45,7 @@ class WrongSign(OffsetFile):
 class NeedsNoArming(OffsetFile):
     def open(self) -> None:
         super().open()
-        self._door.limit = 1.0
+        self._interlock.limit = 1.0
 
 
 class WritesChangesOnly(OffsetFile):
@@ -59,7 +59,7 @@ class WritesChangesOnly(OffsetFile):
 
 class ZeroOnClosing(OffsetFile):
     def close(self) -> None:
-        if self._open and self._door.limit:
+        if self._open and self._interlock.limit:
             super().write((0.0, 0.0, 0.0))
         super().close()
 

@@ -126,14 +126,14 @@ def test_missed_target_has_no_reading(sensor: PointSensor) -> None:
     across = np.array([u[2], 0.0, -u[0]]) / np.hypot(u[0], u[2])
     behind = Plane(u, np.zeros(3))
     grazed = Plane(np.cos(80 * DEG) * -u + np.sin(80 * DEG) * across, np.zeros(3))
-    beside = Plane(-u, 0.05 * across, reach=0.04)
+    beside = Plane(-u, 0.05 * across, radius=0.04)
     bar = CheckBar(0.03 * across, np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 0.0]), 25e-3)
     above = replace(bar, point=np.array([0.0, 0.2, 0.0]) + 0.02 * u, length=0.1)
     for target in (behind, grazed, beside, bar, above):
         assert np.isnan(sensor.still(target, start)).all()
         assert np.isnan(sensor.still(target, start, inclination_error=False)).all()
         assert np.isnan(sensor.still(target, start, beyond=True)).all()
-    for target in (replace(beside, reach=0.06), replace(above, length=0.5)):
+    for target in (replace(beside, radius=0.06), replace(above, length=0.5)):
         assert np.isfinite(sensor.still(target, start)).all()
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from errormotion.twin.heat.network import Ambient, LagResponse, ThermalNetwork
 from errormotion.twin.kinds import KINDS
 from errormotion.twin.schedule import Event
+from errormotion.twin.thermal.network import Ambient, LagResponse, ThermalNetwork
 
 AIR = Ambient(20.0, np.array([0.5, 0.1]), 2 * np.pi / np.array([86400.0, 2500.0]), np.array([0.3, 2.0]))
 TIMES = np.array([0.0, 1000.0, 4000.0])

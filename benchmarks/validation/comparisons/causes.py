@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, ncx2
 
 from errormotion.compare import compare
+from errormotion.compare.comparable import comparable_errors
 from errormotion.compare.diagnosis.causes import FACTORS, TURNS
-from errormotion.compare.ground import common_ground
 from errormotion.compare.stack import difference
 from errormotion.datasets import DOF
 from errormotion.datasets.timing import later
@@ -173,7 +173,7 @@ def pair(arrangement: int, seed: int) -> tuple[Drawn, Drawn]:
 
 
 def _noncentrality(a: Drawn, b: Drawn) -> tuple[float, int]:
-    d = difference(*common_ground({"A": a.dataset(None), "B": b.dataset(None)}).estimates)
+    d = difference(*comparable_errors({"A": a.dataset(None), "B": b.dataset(None)}).estimates)
     white = whitener(d.own, d.influence)
     return white.square(d.value), white.degrees
 

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.stats import chi2, kstest, ncx2
 
 from errormotion.compare import compare, explain
+from errormotion.compare.comparable import comparable_errors
 from errormotion.compare.diagnosis import SCORE_MARGIN
-from errormotion.compare.ground import common_ground
 from errormotion.compare.pairs import pair as judged
 from errormotion.compare.stack import difference
 from errormotion.datasets.timing import later
@@ -103,8 +103,8 @@ def pair(seed: int) -> tuple[Drawn, Drawn]:
 
 def noncentrality(a: Drawn, b: Drawn) -> tuple[float, int]:
     """Return the non-centrality of the joint chi-square of two datasets without noise, and its degrees of freedom."""
-    ground = common_ground({"A": a.dataset(None), "B": b.dataset(None)})
-    d = difference(*ground.estimates)
+    common = comparable_errors({"A": a.dataset(None), "B": b.dataset(None)})
+    d = difference(*common.estimates)
     white = whitener(d.own, d.influence)
     return white.square(d.value), white.degrees
 
@@ -141,8 +141,8 @@ def margin(mistake: Mistake, size: float, factor: float) -> float:
     """
     a, b = (replace(each, factor=factor) for each in pair(0))
     sets = {"A": a.dataset(None), "B": mistake.apply(b, size).dataset(None)}
-    ground = common_ground(sets)
-    causes = explain(*ground.estimates, sets, ground)
+    common = comparable_errors(sets)
+    causes = explain(*common.estimates, sets, common)
     planted = next((cause.score for cause in causes if _same(cause.name, mistake.cause)), float("nan"))
     return planted - max([0.0, *(cause.score for cause in causes if not _same(cause.name, mistake.cause))])
 
@@ -173,8 +173,8 @@ def clean(seed: int) -> list[float]:
     found = []
     for number in range(DRAWS):
         rng = np.random.default_rng([seed, len(MISTAKES) + 1, number])
-        ground = common_ground({"A": a.dataset(rng), "B": b.dataset(rng)})
-        found.append(judged(*ground.estimates).joint.p)
+        common = comparable_errors({"A": a.dataset(rng), "B": b.dataset(rng)})
+        found.append(judged(*common.estimates).joint.p)
     return found
 
 

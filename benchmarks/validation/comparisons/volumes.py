@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from errormotion.compare import compare
-from errormotion.compare.ground import common_ground
+from errormotion.compare.comparable import comparable_errors
 from errormotion.datasets import DOF
 from errormotion.methods.multilateration import Multilateration, Settings, simulation
 from errormotion.twin import VirtualMachine
@@ -55,7 +55,7 @@ def axis(task: tuple[str, str, int]) -> dict:
     measured["covariance"] = truth["covariance"] + np.diag(U_AXIS**2)
     truth["covariance"] = truth["covariance"] + 1e-9 * np.diag(U_AXIS**2)
     found = compare({"axis": measured, "volume": volume}, causes=False)
-    exact = common_ground({"axis": truth, "volume": volume}, freedoms=[str(each) for each in found["dof"].values])
+    exact = comparable_errors({"axis": truth, "volume": volume}, freedoms=[str(each) for each in found["dof"].values])
     return against(found, exact.estimates[0].value)
 
 

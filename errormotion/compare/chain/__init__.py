@@ -12,7 +12,7 @@ from errormotion.arrays import Array
 from errormotion.compare.chain.curve import Curve, measured, reference_weights
 from errormotion.compare.chain.straightness import TABLE, TOOL, at_reference, from_line, levers
 from errormotion.compare.chain.volume import SAME, predict
-from errormotion.compare.placed import Placed, Stored
+from errormotion.compare.point_errors import PointErrors, Stored
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import between, later
 from errormotion.errors import DatasetError
@@ -84,7 +84,7 @@ def on_axis(
         "through the first and the last: squareness, datum and constant parts are not compared."
     )
 
-    def relative(each: Placed) -> Placed:
+    def relative(each: PointErrors) -> PointErrors:
         return _placed(_curve(each).relative(weights))
 
     stored = {
@@ -103,11 +103,11 @@ def on_axis(
     return placed, stored
 
 
-def _placed(curve: Curve) -> Placed:
-    return Placed(curve.value, curve.own, curve.influence, curve.source, curve.identity)
+def _placed(curve: Curve) -> PointErrors:
+    return PointErrors(curve.value, curve.own, curve.influence, curve.source, curve.identity)
 
 
-def _curve(each: Placed) -> Curve:
+def _curve(each: PointErrors) -> Curve:
     return Curve(each.value, each.own, each.influence, each.source, [""] * len(each.source), each.identity)
 
 

@@ -15,7 +15,7 @@ import xarray as xr
 
 from errormotion.arrays import Array, filled
 from errormotion.compare.chain.curve import Curve, reference_weights
-from errormotion.compare.placed import Placed
+from errormotion.compare.point_errors import PointErrors
 from errormotion.datasets.schemas import STRAIGHTNESS_REFERENCES
 from errormotion.kinematics import twists
 from errormotion.kinematics.iso import DOF, LINEAR_AXES, direction_of, is_straightness
@@ -76,13 +76,13 @@ def lever_to(place: str, q: Array, axis: str) -> Array:
     return shift
 
 
-def from_line(placed: Placed, positions: Array, axis: str) -> Placed:
+def from_line(placed: PointErrors, positions: Array, axis: str) -> PointErrors:
     """Return the errors with straightness relative to the line through the first and the last known position."""
     weights = np.nan_to_num(reference_weights([placed.value], positions, axis))
     weights[:, :, [k for k in range(6) if not is_straightness(k, axis)]] = 0.0
     own, F = filled(placed.own), placed.influence
     curve = Curve(placed.value, own, F, placed.source, [""] * len(placed.source), placed.identity).relative(weights)
-    return Placed(curve.value, curve.own, curve.influence, curve.source, curve.identity)
+    return PointErrors(curve.value, curve.own, curve.influence, curve.source, curve.identity)
 
 
 def _straight(ds: xr.Dataset) -> list[str]:

@@ -27,8 +27,8 @@ from scipy import special
 
 from errormotion.arrays import Array
 from errormotion.compare.diagnosis.causes import Added, AnyCause, Mapped, Read, Shifted, Side, candidates
-from errormotion.compare.diagnosis.shift import Course, fitted
-from errormotion.compare.placed import Stored
+from errormotion.compare.diagnosis.shift import SmoothCurves, fitted
+from errormotion.compare.point_errors import Stored
 from errormotion.compare.stack import Estimate, difference
 from errormotion.estimation.low_rank import Whitener, whitener
 from errormotion.kinematics.iso import DOF
@@ -124,7 +124,7 @@ def diagnose(
     *,
     time: Array | None = None,
     temperatures: Mapping[str, Array] | None = None,
-    courses: Mapping[str, Course] | None = None,
+    curves: Mapping[str, SmoothCurves] | None = None,
 ) -> list[Cause]:
     """Return the causes of the difference of two estimates that are more likely than chance, the most likely one first.
 
@@ -140,7 +140,7 @@ def diagnose(
         Times, s; without them no cause in time is tested.
     temperatures : mapping of str to ndarray (n,), optional
         Recorded temperatures, degC, for an expansion.
-    courses : mapping of str to Course, optional
+    curves : mapping of str to SmoothCurves, optional
         Smoothed errors by dataset, over its whole record, for a shift in time.
 
     Returns
@@ -155,7 +155,7 @@ def diagnose(
     chosen = tuple(freedoms)
     sides = (Side(a, stored[a.name], 1.0, chosen), Side(b, stored[b.name], -1.0, chosen))
     given = _Difference(*sides, d, white, white.square(d.value))
-    tested = list(candidates(*sides, time, temperatures or {}, courses or {}))
+    tested = list(candidates(*sides, time, temperatures or {}, curves or {}))
     members = Counter(family for family, _ in {(each.family, _kind(each)) for each in tested})
     by_kind: dict[str, Cause] = {}
     for candidate in tested:
@@ -336,7 +336,7 @@ def _read(candidate: Read) -> _Found:
 
 
 def _shifted(candidate: Shifted, given: _Difference) -> _Found | None:
-    shift = fitted(candidate.course, candidate.sign, candidate.time, given.d.value, given.white)
+    shift = fitted(candidate.curves, candidate.sign, candidate.time, given.d.value, given.white)
     if shift is None or shift.gain <= 0:
         return None
     size = Size("shift", shift.value, shift.standard_uncertainty, "s")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from errormotion.arrays import Array, filled
-from errormotion.compare.diagnosis.shift import Course, smooth
-from errormotion.compare.placed import Placed, Stored
+from errormotion.compare.diagnosis.shift import SmoothCurves, smooth
+from errormotion.compare.point_errors import PointErrors, Stored
 from errormotion.compare.stack import Estimate
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import adjoint
@@ -53,7 +53,7 @@ class Side:
         """Name of the dataset."""
         return self.given.name
 
-    def estimate(self, placed: Placed) -> Estimate:
+    def estimate(self, placed: PointErrors) -> Estimate:
         """Return errors on common ground as an estimate of the compared freedoms."""
         return placed.estimate(self.name, self.freedoms)
 
@@ -70,7 +70,7 @@ class Side:
         """Freedoms that the dataset states and that affect the compared ones."""
         k = [DOF.index(name) for name in self.freedoms]
         acts = np.abs(self.stored.transfer[k]).max(axis=0) > 0
-        return [name for name, each in zip(DOF, acts, strict=True) if each and name in self.stored.placed.seen]
+        return [name for name, each in zip(DOF, acts, strict=True) if each and name in self.stored.errors.seen]
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Shifted:
     """A shift in time: smoothed errors of the first dataset (sign 1) or of the second one (-1)."""
 
     family: str
-    course: Course
+    curves: SmoothCurves
     sign: float
     time: Array
 
@@ -135,7 +135,7 @@ AnyCause = Added | Mapped | Read | Shifted
 
 
 def candidates(
-    a: Side, b: Side, time: Array | None, temperatures: Mapping[str, Array], courses: Mapping[str, Course]
+    a: Side, b: Side, time: Array | None, temperatures: Mapping[str, Array], curves: Mapping[str, SmoothCurves]
 ) -> Iterator[AnyCause]:
     """Yield every cause that can be tested with two datasets."""
     yield from _functional_points(a, b)
@@ -148,7 +148,7 @@ def candidates(
     n = len(a.given.value)
     yield from _profile(a, b, np.ones(n), "reference state", "constant difference (reference state)")
     if time is not None and n > 2:
-        yield from _shift(a, b, time, courses)
+        yield from _shift(a, b, time, curves)
         yield from _steps(a, b, time)
         yield from _profile(a, b, time - time[0], "drift of a sensor", "drift of a sensor (linear in time)", per="/s")
     for name, temperature in temperatures.items():
@@ -258,13 +258,13 @@ def _straightness(a: Side, b: Side) -> Iterator[Read]:
             yield Read("reference of the straightness", name, (before[0], before[1]), after, effect)
 
 
-def _shift(a: Side, b: Side, time: Array, courses: Mapping[str, Course]) -> Iterator[Shifted]:
+def _shift(a: Side, b: Side, time: Array, curves: Mapping[str, SmoothCurves]) -> Iterator[Shifted]:
     found = {
-        each.sign: courses.get(each.name)
+        each.sign: curves.get(each.name)
         or smooth(time, each.given.value, np.sqrt(np.diagonal(each.given.own, axis1=1, axis2=2)))
         for each in (a, b)
     }
-    known = {sign: course for sign, course in found.items() if course is not None}
+    known = {sign: each for sign, each in found.items() if each is not None}
     if known:
         sign = max(known, key=lambda sign: known[sign].instants)
         yield Shifted("shift in time", known[sign], sign, time)

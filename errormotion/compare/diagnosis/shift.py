@@ -39,7 +39,7 @@ class Shift(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Course:
+class SmoothCurves:
     """Smoothed errors of one dataset over the common time axis, one curve for each freedom.
 
     Attributes
@@ -68,7 +68,7 @@ class Course:
         return changed
 
 
-def smooth(time: Array, values: Array, u: Array) -> Course | None:
+def smooth(time: Array, values: Array, u: Array) -> SmoothCurves | None:
     """Return smoothed values (n, d) with standard uncertainties (n, d); None if too few are known."""
     curves = []
     for y, sigma in zip(values.T, u.T, strict=True):
@@ -81,10 +81,10 @@ def smooth(time: Array, values: Array, u: Array) -> Course | None:
             weights = 1 / np.maximum(sigma[known], 1e-3 * least)
             t, c, k = splrep(time[known], y[known], w=weights, s=float(known.sum()))
         curves.append(BSpline(t, c, k, extrapolate=True))
-    return Course(tuple(curves), float(time[0]), float(time[-1]), len(time))
+    return SmoothCurves(tuple(curves), float(time[0]), float(time[-1]), len(time))
 
 
-def course_of(ds: xr.Dataset, freedoms: Sequence[str]) -> Course | None:
+def curves_of(ds: xr.Dataset, freedoms: Sequence[str]) -> SmoothCurves | None:
     """Return the smoothed errors of a dataset over time."""
     columns = [DOF.index(name) for name in freedoms]
     own = np.asarray(ds["covariance"].values, dtype=float) - products(influence_of(ds))
@@ -93,12 +93,12 @@ def course_of(ds: xr.Dataset, freedoms: Sequence[str]) -> Course | None:
     return smooth(np.asarray(ds["time"].values, dtype=float), values, u[:, columns])
 
 
-def fitted(course: Course, sign: float, time: Array, difference: Array, white: Whitener) -> Shift | None:
+def fitted(curves: SmoothCurves, sign: float, time: Array, difference: Array, white: Whitener) -> Shift | None:
     """Return the shift that explains a difference (n, d) best; None if the errors do not change.
 
     Parameters
     ----------
-    course : Course
+    curves : SmoothCurves
     sign : float
         1: the smoothed errors are those of the first dataset of the pair; -1: of the second one.
     time : ndarray, (n,)
@@ -111,7 +111,7 @@ def fitted(course: Course, sign: float, time: Array, difference: Array, white: W
     known = np.isfinite(difference)
 
     def effect(shift: float) -> Array:
-        return np.where(known, course.effect(time, shift, sign), 0.0)
+        return np.where(known, curves.effect(time, shift, sign), 0.0)
 
     sizes = np.geomspace(MIN_SHIFT, max(float(np.ptp(time)) / 4, 2 * MIN_SHIFT), TRIES)
     tries = np.concatenate([-sizes[::-1], sizes])

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
-from errormotion.compare.ground import Ground, common_ground
+from errormotion.compare.comparable import ComparableErrors, comparable_errors
 from errormotion.compare.stack import Estimate, gathered
 from errormotion.compensation.effect.figures import paired
 from errormotion.compensation.effect.magnitude import Curve, Interval, magnitude, ratio
@@ -49,7 +49,7 @@ def effect(
     before, after : Dataset
         Error datasets.
     at, freedoms, since
-        As of `errormotion.compare.ground.common_ground`.
+        As of `errormotion.compare.comparable.comparable_errors`.
     tolerances : Tolerances, optional
         Limits of figures and freedoms, also of figures such as ``reduction of EX``.
 
@@ -67,19 +67,19 @@ def effect(
         raise DatasetError(
             f"'{planned[0]}': a plan contains no measured errors; expected a measurement", code="effect.dataset.planned"
         )
-    ground = common_ground(_aligned(results), at=at, freedoms=freedoms, since=since)
-    names = [*ground.freedoms]
+    common = comparable_errors(_aligned(results), at=at, freedoms=freedoms, since=since)
+    names = [*common.freedoms]
     groups: list[tuple[tuple[int, ...], str]] = [((k,), name) for k, name in enumerate(names)]
     linear = tuple(k for k, name in enumerate(names) if name in DOF[:3])
     if len(linear) > 1:
         groups.append((linear, DISPLACEMENT))
-    references = _references(ground.estimates[1], after)
-    parts = tuple(_part(ground, columns, name, references) for columns, name in groups)
+    references = _references(common.estimates[1], after)
+    parts = tuple(_part(common, columns, name, references) for columns, name in groups)
     figures, failures = paired(before, after)
-    notes = [*ground.notes, *_remarks(ground, parts, results), *failures]
+    notes = [*common.notes, *_remarks(common, parts, results), *failures]
     judged = [None if tolerances is None else judge(ds, tolerances) for ds in (before, after)]
     gained = None if tolerances is None else judge_figures([_as_figure(part) for part in parts], tolerances)
-    return Effect(parts, figures, ground, judged[0], judged[1], gained, tuple(notes))
+    return Effect(parts, figures, common, judged[0], judged[1], gained, tuple(notes))
 
 
 def _aligned(results: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
@@ -88,13 +88,13 @@ def _aligned(results: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     return {name: ds.assign_attrs(start=start) for name, ds in results.items()}
 
 
-def _part(ground: Ground, columns: tuple[int, ...], name: str, references: set[str]) -> Part:
+def _part(common: ComparableErrors, columns: tuple[int, ...], name: str, references: set[str]) -> Part:
     """Return one freedom, or several as one vector."""
-    before, after = (_columns(each, columns) for each in ground.estimates)
+    before, after = (_columns(each, columns) for each in common.estimates)
     known: NDArray[np.bool_] = np.isfinite(np.sum(before.value + after.value, axis=1))
-    if ground.dim == "time":
+    if common.dim == "time":
         known[0] = False  # the reference: 0 by definition
-    unit = "rad" if ground.freedoms[columns[0]] in DOF[3:] else "m"
+    unit = "rad" if common.freedoms[columns[0]] in DOF[3:] else "m"
     correctable = unit == "m"
     if not known.any():
         nothing = Interval(math.nan, math.nan, math.nan)
@@ -145,14 +145,14 @@ def _as_figure(part: Part) -> FigureOfMerit:
     return FigureOfMerit(f"reduction of {part.name}", value, max(value - low, high - value), "1")
 
 
-def _remarks(ground: Ground, parts: Sequence[Part], results: dict[str, xr.Dataset]) -> list[str]:
+def _remarks(common: ComparableErrors, parts: Sequence[Part], results: dict[str, xr.Dataset]) -> list[str]:
     found = []
-    if ground.dim == "time":
+    if common.dim == "time":
         found.append(
             "Time 0 of both results is treated as the same time of the warm-up. The reduction is that of the "
             "compensation if both had the same duty."
         )
-        if text := _heat(ground, results):
+        if text := _heat(common, results):
             found.append(text)
     if any(not part.correctable for part in parts):
         found.append(
@@ -162,9 +162,9 @@ def _remarks(ground: Ground, parts: Sequence[Part], results: dict[str, xr.Datase
     return found
 
 
-def _heat(ground: Ground, results: dict[str, xr.Dataset]) -> str:
+def _heat(common: ComparableErrors, results: dict[str, xr.Dataset]) -> str:
     """Return the temperature whose rise differs most between both results; empty without common temperatures."""
-    last = float(ground.coords["time"].values[-1])
+    last = float(common.coords["time"].values[-1])
     rises: list[dict[str, float]] = []
     for ds in results.values():
         if "temperature" not in ds.variables or set(ds["temperature"].dims) != {"time", "sensor"}:

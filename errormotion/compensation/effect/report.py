@@ -44,7 +44,7 @@ def write(found: Effect, after: xr.Dataset, out: Path, form: Form = PLAIN) -> Pa
         Language, paper, and files written in addition to the page.
     """
     source = Source(after, None, {}, {})
-    title = f"Effect of a compensation: {found.ground.machine}"
+    title = f"Effect of a compensation: {found.common.machine}"
     return write_page([source], lambda: [part(found, source.key)], out, title, form=form, texts=texts)
 
 
@@ -75,7 +75,7 @@ def _key_figures(found: Effect) -> list[KeyFigure]:
 
 
 def _curves(found: Effect, key: str) -> Figure:
-    height = PANEL * len(found.ground.freedoms) + 0.6
+    height = PANEL * len(found.common.freedoms) + 0.6
     svg = draw(lambda figure: paint(figure, found), f"{key}-effect", height, WIDTH)
     return Figure(
         svg,
@@ -114,30 +114,30 @@ def _figures(found: Effect) -> list[Section]:
 
 
 def _ground(found: Effect) -> str:
-    ground = found.ground
-    point = ", ".join(f"{1e3 * float(each) + 0.0:g}" for each in np.atleast_1d(ground.point))
-    return f"Machine {ground.machine}, {ground.component}, frame '{ground.frame}', functional point ({point}) mm."
+    common = found.common
+    point = ", ".join(f"{1e3 * float(each) + 0.0:g}" for each in np.atleast_1d(common.point))
+    return f"Machine {common.machine}, {common.component}, frame '{common.frame}', functional point ({point}) mm."
 
 
 def plot(found: Effect) -> Canvas:
     """Return the figure of the errors before and after, a row for each freedom."""
     with style():
-        figure = Canvas(figsize=(WIDTH, PANEL * len(found.ground.freedoms) + 0.6), facecolor="white")
+        figure = Canvas(figsize=(WIDTH, PANEL * len(found.common.freedoms) + 0.6), facecolor="white")
         paint(figure, found)
     return figure
 
 
 def paint(figure: Canvas, found: Effect) -> None:
     """Fill a figure with the errors before and after."""
-    ground = found.ground
+    common = found.common
     high = figure.get_size_inches()[1]
-    panels = figure.subplots(len(ground.freedoms), 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.18})[:, 0]
+    panels = figure.subplots(len(common.freedoms), 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.18})[:, 0]
     figure.subplots_adjust(left=0.09, right=0.985, top=1 - 0.28 / high, bottom=0.42 / high)
     places, label, joined = abscissa(found)
-    for k, (name, axes) in enumerate(zip(ground.freedoms, panels, strict=True)):
+    for k, (name, axes) in enumerate(zip(common.freedoms, panels, strict=True)):
         factor, unit = FIELD_UNITS["m" if name in ("EX", "EY", "EZ") else "rad"]
         axes.axhline(0, color="#888888", lw=0.5)
-        for number, estimate in enumerate(ground.estimates):
+        for number, estimate in enumerate(common.estimates):
             _draw(axes, places, estimate, k, factor, joined, 0.12 * (number - 0.5))
         axes.set_ylabel(f"{name} / {unit}")
     figure.align_ylabels()
@@ -158,11 +158,11 @@ def _draw(axes: Axes, places: Array, estimate: Estimate, k: int, factor: float, 
 
 def abscissa(found: Effect) -> tuple[Array, str, bool]:
     """Return the abscissae of the common points, their label, and whether lines join the values."""
-    ground = found.ground
-    if ground.dim == "time":
-        return np.asarray(ground.coords["time"].values, dtype=float) / 60.0, "time / min", True
+    common = found.common
+    if common.dim == "time":
+        return np.asarray(common.coords["time"].values, dtype=float) / 60.0, "time / min", True
     for name in ("x", "y", "z"):
-        if ground.dim == "position" and name in ground.coords:
-            return np.asarray(ground.coords[name].values, dtype=float) * 1e3, f"{name.upper()} / mm", True
-    count = len(ground.estimates[0].value)
-    return np.arange(count, dtype=float), f"{ground.dim} number" if ground.dim else "", False
+        if common.dim == "position" and name in common.coords:
+            return np.asarray(common.coords[name].values, dtype=float) * 1e3, f"{name.upper()} / mm", True
+    count = len(common.estimates[0].value)
+    return np.arange(count, dtype=float), f"{common.dim} number" if common.dim else "", False

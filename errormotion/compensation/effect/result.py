@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from errormotion.compare.ground import Ground
+from errormotion.compare.comparable import ComparableErrors
 from errormotion.compensation.effect.magnitude import Interval
 from errormotion.tolerances.conformity import Conformity
 
@@ -77,7 +77,7 @@ class Effect:
     parts : tuple of Part
         Each common freedom, then the displacement as a whole.
     figures : tuple of FigurePair
-    ground : Ground
+    common : ComparableErrors
         Both results, ``before`` and ``after``, at the same points.
     before, after, gained : Conformity or None
         Decisions on the limits: of both results, and on ``reduction of ...``.
@@ -86,7 +86,7 @@ class Effect:
 
     parts: tuple[Part, ...]
     figures: tuple[FigurePair, ...]
-    ground: Ground
+    common: ComparableErrors
     before: Conformity | None
     after: Conformity | None
     gained: Conformity | None

@@ -63,9 +63,9 @@ def rehearse(
     follower.arm(np.zeros(3))
     offset, states, causes = np.zeros((len(time), 3)), [], []
     for k, now in enumerate(time):
-        heat = {name: float(values[k]) for name, values in temperature.items()}
+        measured = {name: float(values[k]) for name, values in temperature.items()}
         speeds = {name: float(values[k]) for name, values in parameter.items()}
-        prediction = predictor.update(float(now), heat, speeds)
+        prediction = predictor.update(float(now), measured, speeds)
         cause = refusal(prediction, limits)
         target = None if cause else -prediction.errors[:3]
         probing = "probing" if busy is not None and busy[k] else ""

@@ -16,10 +16,10 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
-from errormotion.instruments.compensator.door import OffsetDoor
 from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.driver import SECRET_BYTES, client_name, read_token
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.interlock import OffsetInterlock
 from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.recording import RecordingTransport, ReplayTransport
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
@@ -64,7 +64,7 @@ class LinuxCNCOffset(Driver):
 
     def __init__(self, address: str, settings: Any = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
-        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._interlock = OffsetInterlock(f"{self.info.id} at {address}")
         self._number = 0
         self._may_write = False
         self._secret = secrets.token_hex(SECRET_BYTES)
@@ -80,7 +80,7 @@ class LinuxCNCOffset(Driver):
 
     def close(self) -> None:
         """Disconnect and disarm; the watchdog in the servo thread ramps the offset to zero. Idempotent."""
-        self._door.disarm()
+        self._interlock.disarm()
         super().close()
 
     def identify(self) -> Identity:
@@ -96,7 +96,7 @@ class LinuxCNCOffset(Driver):
         InstrumentError
             Another program has the right, the bridge refuses it, or its limit is below this one.
         """
-        self._door.arm(limit)
+        self._interlock.arm(limit)
         try:
             found = self._state()
             if found.limit < limit * (1 - 1e-6):
@@ -107,7 +107,7 @@ class LinuxCNCOffset(Driver):
                 )
             self._claim(self.transport)
         except BaseException:
-            self._door.disarm()
+            self._interlock.disarm()
             raise
 
     def read(self) -> Applied:
@@ -133,7 +133,7 @@ class LinuxCNCOffset(Driver):
             Not armed, beyond the limit, not three finite numbers; no answer; or the bridge refuses the offset: another
             program compensates, the machine is off, or the change is too large.
         """
-        values, line = self._door.offset(offset), self.transport
+        values, line = self._interlock.offset(offset), self.transport
         if not self._may_write:
             self._claim(line)
         self._request("set_offset", offset=list(values))

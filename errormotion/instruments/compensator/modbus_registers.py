@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from errormotion.errors import InstrumentError
-from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
 from errormotion.instruments.compensator.owner import NO_OWNER, Owner
 from errormotion.instruments.compensator.register_map import SIZES, RegisterSettings, runs
+from errormotion.instruments.interlock import ROUNDING, OffsetInterlock
 from errormotion.instruments.modbus_driver import ModbusDriver
 from errormotion.instruments.transports.modbus.client import READ_HOLDING
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo
@@ -62,14 +62,14 @@ class ModbusRegisters(ModbusDriver):
 
     def __init__(self, address: str, settings: RegisterSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
-        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._interlock = OffsetInterlock(f"{self.info.id} at {address}")
         self._heartbeat = 0
         self._owner = Owner(f"{self.info.id} at {address}", self._read_owner, self._write_owner)
         self.note = "" if self.settings.owner is not None else NO_OWNER
 
     def close(self) -> None:
         """Disconnect and disarm; the watchdog of the PLC ramps to zero. Idempotent."""
-        self._door.disarm()
+        self._interlock.disarm()
         self._owner.release()
         super().close()
 
@@ -96,7 +96,7 @@ class ModbusRegisters(ModbusDriver):
             )
         if self.settings.owner is not None:
             self._owner.take()
-        self._door.arm(limit)
+        self._interlock.arm(limit)
 
     def read(self) -> Applied:
         """Return the offset in effect, m, and the states of the PLC.
@@ -126,10 +126,10 @@ class ModbusRegisters(ModbusDriver):
             offset was sent. For other errors see `ModbusLine.write_registers`.
         """
         line, settings = self.line, self.settings
-        values = self._door.offset(offset)
+        values = self._interlock.offset(offset)
         if settings.owner is not None:
             self._owner.require()
-        most = int(self._door.limit * (1 + ROUNDING) / settings.scale)
+        most = int(self._interlock.limit * (1 + ROUNDING) / settings.scale)
         words: dict[int, int] = {}
         for first, value in zip(settings.offset, values, strict=True):
             count = min(max(round(value / settings.scale), -most), most)

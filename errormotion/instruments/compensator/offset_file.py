@@ -19,7 +19,7 @@ from errormotion.datasets.files.reading import require_regular
 from errormotion.datasets.files.writing import replace_text
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError
-from errormotion.instruments.compensator.door import OffsetDoor
+from errormotion.instruments.interlock import OffsetInterlock
 from errormotion.plugins import Applied, CompensatorSubject, Identity, InstrumentInfo, PluginSettings
 
 SCHEMA = "errormotion.offset/1"
@@ -64,7 +64,7 @@ class OffsetFile:
         self.address = address
         self.settings: Any = self.Settings() if settings is None else settings
         self.path = Path(address.removeprefix("file://"))
-        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._interlock = OffsetInterlock(f"{self.info.id} at {address}")
         self._number = 0
         self._open = False
 
@@ -91,7 +91,7 @@ class OffsetFile:
     def close(self) -> None:
         """Write nothing further: the file keeps the last offset, which expires after ``valid``. Idempotent."""
         self._open = False
-        self._door.disarm()
+        self._interlock.disarm()
 
     def identify(self) -> Identity:
         """Return the name of the file."""
@@ -101,7 +101,7 @@ class OffsetFile:
     def arm(self, limit: float) -> None:
         """Permit offsets up to a limit for each axis, m; nothing is written."""
         self._require_open()
-        self._door.arm(limit)
+        self._interlock.arm(limit)
 
     def read(self) -> Applied:
         """Return the offset that the reader reports, or the last one written; zero before the first."""
@@ -127,7 +127,7 @@ class OffsetFile:
             The driver is not armed, an offset is beyond the limit or not finite, or the file cannot be written.
         """
         self._require_open()
-        values = dict(zip("XYZ", self._door.offset(offset), strict=True))
+        values = dict(zip("XYZ", self._interlock.offset(offset), strict=True))
         self._number += 1
         content = {"schema": SCHEMA, "number": self._number, "unit": "m", "valid": self.settings.valid, **values}
         try:

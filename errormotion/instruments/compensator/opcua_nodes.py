@@ -15,9 +15,9 @@ from pydantic import Field, model_validator
 
 from errormotion.datasets.units import Length, Time
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.compensator.door import ROUNDING, OffsetDoor
 from errormotion.instruments.compensator.owner import NO_OWNER, Owner
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.interlock import ROUNDING, OffsetInterlock
 from errormotion.instruments.transports import Transport
 from errormotion.instruments.transports.opc import open_session, request
 from errormotion.instruments.transports.opc_security import Credentials
@@ -105,7 +105,7 @@ class OpcUaNodes(Driver):
 
     def __init__(self, address: str, settings: OpcUaNodesSettings | None = None, *, record: Path | None = None) -> None:
         super().__init__(address, settings, record=record)
-        self._door = OffsetDoor(f"{self.info.id} at {address}")
+        self._interlock = OffsetInterlock(f"{self.info.id} at {address}")
         self._types: list[str] = []
         self._beat, self._beats = 0, BEATS
         self._owner = Owner(f"{self.info.id} at {address}", self._read_owner, self._write_owner)
@@ -114,7 +114,7 @@ class OpcUaNodes(Driver):
 
     def close(self) -> None:
         """Disconnect and disarm; the watchdog at the other end ramps to zero. Idempotent."""
-        self._door.disarm()
+        self._interlock.disarm()
         self._owner.release()
         super().close()
 
@@ -151,7 +151,7 @@ class OpcUaNodes(Driver):
                 )
         if self.settings.owner:
             self._owner.take()
-        self._door.arm(limit)
+        self._interlock.arm(limit)
 
     def read(self) -> Applied:
         """Return the offset in effect, m, NaN where the status of a value is not Good, and the states of the server.
@@ -176,7 +176,7 @@ class OpcUaNodes(Driver):
             offset was sent. Or the connection is lost, or the server did not accept a value.
         """
         line, settings = self.transport, self.settings
-        numbers = [self._held(kind, x) for kind, x in zip(self._types, self._door.offset(offset), strict=False)]
+        numbers = [self._held(kind, x) for kind, x in zip(self._types, self._interlock.offset(offset), strict=False)]
         if settings.owner:
             self._owner.require()
         self._beat = (self._beat + 1) % self._beats
@@ -219,7 +219,7 @@ class OpcUaNodes(Driver):
         scale = self.settings.scale
         if kind in FRACTIONS:
             return offset / scale
-        most = int(self._door.limit * (1 + ROUNDING) / scale)
+        most = int(self._interlock.limit * (1 + ROUNDING) / scale)
         return min(max(round(offset / scale), -most), most)
 
     def _values(self, nodes: Any) -> list[Any]:

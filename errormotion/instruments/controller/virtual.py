@@ -15,8 +15,8 @@ from pydantic import Field
 
 from errormotion.datasets.units import Time
 from errormotion.errors import InstrumentError, ProtocolError
-from errormotion.instruments.door import ArmedSettings, Door
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.interlock import ArmedSettings, Interlock
 from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.plugins import Identity, InstrumentInfo, InstrumentSubject, MachineLimits
@@ -124,7 +124,7 @@ class VirtualController(Driver):
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
         super().__init__(address, settings, record=record)
-        self._door = Door(self.info.id, address)
+        self._interlock = Interlock(self.info.id, address)
 
     @classmethod
     def conformance(cls) -> InstrumentSubject:
@@ -150,7 +150,7 @@ class VirtualController(Driver):
 
     def bound(self, limits: MachineLimits) -> None:
         """Apply limits to every command from now on."""
-        self._door.limits = limits
+        self._interlock.limits = limits
 
     def read(self) -> dict[str, Any]:
         """Return the present state."""
@@ -241,7 +241,7 @@ class VirtualController(Driver):
 
     def elapse(self, seconds: float) -> None:
         """Advance the simulated time without samples."""
-        self._call("elapse", seconds=self._door.duration(seconds))
+        self._call("elapse", seconds=self._interlock.duration(seconds))
 
     def run_steps(
         self,
@@ -276,10 +276,10 @@ class VirtualController(Driver):
         dict
             ``duration`` of the motion and ``longest_lead_in`` before it, s.
         """
-        self._door.extent([float(step) * (count - 1) * float(u) for u in direction], "steps")
+        self._interlock.extent([float(step) * (count - 1) * float(u) for u in direction], "steps")
         if not all(math.isfinite(x) for x in start):
             raise InstrumentError(f"Expected a start of three finite numbers; found {start!r}", code="position.form")
-        self._door.feed(step / travel if travel > 0 else math.nan)
+        self._interlock.feed(step / travel if travel > 0 else math.nan)
         return self._facts(
             "run_steps",
             "duration",
@@ -315,7 +315,7 @@ class VirtualController(Driver):
             Another program runs, a word is unknown or a position is out of travel: nothing moves, and the message
             states the line.
         """
-        check_program(str(text), self._door)
+        check_program(str(text), self._interlock)
         return self._facts("run_program", "duration", text=str(text))
 
     def move_to(self, position: Sequence[float], feed: float | None = None) -> dict[str, Any]:
@@ -341,9 +341,9 @@ class VirtualController(Driver):
         InstrumentError
             The position is out of travel, or another motion runs: nothing moves.
         """
-        goal, limit = self._door.position(position), self._door.limits.feed
+        goal, limit = self._interlock.position(position), self._interlock.limits.feed
         extra = {} if feed is not None or limit is None else {"feed_limit": limit}
-        feed = None if feed is None else self._door.feed(feed)
+        feed = None if feed is None else self._interlock.feed(feed)
         return self._facts("move_to", "duration", position=goal, feed=feed, **extra)
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
@@ -367,7 +367,7 @@ class VirtualController(Driver):
             The probe is tripped before it moves, the spindle turns, the target is out of travel, alarm or emergency
             stop: nothing moves.
         """
-        goal, feed = self._door.position(target, "target"), self._door.feed(feed)
+        goal, feed = self._interlock.position(target, "target"), self._interlock.feed(feed)
         found = self._facts("probe", "tripped", "position", "time", target=goal, feed=feed)
         try:
             position = None if found["position"] is None else [float(x) for x in found["position"]]
@@ -385,7 +385,7 @@ class VirtualController(Driver):
         InstrumentError
             The speed is too high, or the machine is in alarm or emergency stop.
         """
-        self._change("spindle", speed=self._door.speed(speed))
+        self._change("spindle", speed=self._interlock.speed(speed))
 
     def stop(self, *, spindle: bool = False) -> None:
         """Abort all motion of the axes, and with ``spindle`` also stop the spindle; always permitted."""
@@ -447,13 +447,13 @@ class VirtualController(Driver):
         """Return the events of a schedule; InstrumentError unless their spindle speeds are within the limits."""
         events = [event_fields(event) for event in schedule]
         for event in events:
-            self._door.speed(event.get("spindle_speed", 0.0))
+            self._interlock.speed(event.get("spindle_speed", 0.0))
         return events
 
     def _change(self, op: str, **arguments: Any) -> Any:
         """Send a command that moves or changes the machine."""
         words = ", ".join(f"{name} {value}" for name, value in arguments.items())
-        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
+        self._interlock.require_armed(self.settings.arm, f"{op.replace('_', ' ')} {words}")
         return self._call(op, **arguments)
 
     def _call(self, op: str, **arguments: Any) -> Any:

@@ -14,8 +14,8 @@ from pydantic import Field
 from errormotion import plugins
 from errormotion.datasets.units import Length, Time, Velocity
 from errormotion.errors import InstrumentError, PluginError, code_of
-from errormotion.instruments.door import ArmedSettings, Door
 from errormotion.instruments.driver import Openable
+from errormotion.instruments.interlock import ArmedSettings, Interlock
 from errormotion.instruments.touch_probe.probe import Probe, corrected, refuse_unmapped
 from errormotion.instruments.touch_probe.settings import ProbeSettings
 from errormotion.instruments.touch_probe.touching import (
@@ -107,7 +107,7 @@ class ControllerProbe(Probe, Openable):
         self.settings = ControllerProbeSettings() if settings is None else settings
         self._record = record
         self._control: Any = None
-        self._door = Door(self.info.id, address)
+        self._interlock = Interlock(self.info.id, address)
 
     # ------------------------------------------------------------------ opening and closing
 
@@ -140,7 +140,7 @@ class ControllerProbe(Probe, Openable):
             )
         control = cls(self.address, settings, record=self._record)
         if hasattr(control, "bound"):
-            control.bound(self._door.limits)
+            control.bound(self._interlock.limits)
         control.open()
         self._control = control
 
@@ -173,7 +173,7 @@ class ControllerProbe(Probe, Openable):
 
     def bound(self, limits: MachineLimits) -> None:
         """Apply limits to every move from now on; the controller applies them to each command."""
-        self._door.limits = limits
+        self._interlock.limits = limits
         if self._control is not None and hasattr(self._control, "bound"):
             self._control.bound(limits)
 
@@ -210,7 +210,7 @@ class ControllerProbe(Probe, Openable):
             is lost.
         """
         touches = list(touches)
-        self._door.admit(self.settings.arm, f"{len(touches)} touches")
+        self._interlock.require_armed(self.settings.arm, f"{len(touches)} touches")
         refuse_unmapped(self._map, touches)
         self._refuse_unfit()
         missed: list[int] = []  # items without a contact since the last contact

@@ -27,13 +27,13 @@ class Plane:
         Unit vector out of the material.
     point : ndarray, (3,)
         m.
-    reach : float
+    radius : float
         Radius of the face about the point, m.
     """
 
     normal: Array
     point: Array
-    reach: float = np.inf
+    radius: float = np.inf
 
     def meet(self, origins: Array, direction: Array) -> tuple[Array, Array]:
         """Return the lengths of beams from origins (n, 3), m, (n,), NaN for a miss, and the normals there (n, 3)."""
@@ -42,7 +42,7 @@ class Plane:
             return np.full(len(origins), np.nan), np.broadcast_to(self.normal, origins.shape)
         depth = (self.point - origins) @ self.normal / facing
         off = np.linalg.norm(origins + depth[:, None] * direction - self.point, axis=1)
-        return np.where(off <= self.reach, depth, np.nan), np.broadcast_to(self.normal, origins.shape)
+        return np.where(off <= self.radius, depth, np.nan), np.broadcast_to(self.normal, origins.shape)
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class SineGauge:
         Deviation of the face along its normal, independent at every setting, m (one sigma).
     angle_uncertainty : float
         Deviation of its normal in each direction, independent at every setting, rad (one sigma).
-    reach : float
+    radius : float
         Radius of the face about the pivot, m.
     steepest : float
         Largest inclination, rad.
@@ -110,7 +110,7 @@ class SineGauge:
     pivot: Array
     point_uncertainty: float = 1e-6
     angle_uncertainty: float = np.radians(5 / 3600)
-    reach: float = 0.08
+    radius: float = 0.08
     steepest: float = np.radians(60.0)
 
     def nominal_normal(self, inclination: float, rotation: float) -> Array:
@@ -155,7 +155,7 @@ class SineGauge:
 
     def face(self, inclination: float, rotation: float, setting: int = 0) -> Plane:
         """Return the face of a setting, see `plane`, as a target."""
-        return Plane(*self.plane(inclination, rotation, setting), self.reach)
+        return Plane(*self.plane(inclination, rotation, setting), self.radius)
 
 
 def seeded_check_bar(rng: np.random.Generator, point: Array) -> CheckBar:

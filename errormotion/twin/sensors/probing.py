@@ -23,7 +23,7 @@ from errormotion.kinematics.twists import cross
 from errormotion.twin import kernels, truth
 from errormotion.twin.artefacts.balls import Balls, Probe, seeded_balls, seeded_probe
 from errormotion.twin.geometry import GeometricErrors
-from errormotion.twin.heat.state import ThermalState
+from errormotion.twin.thermal.state import ThermalState
 
 ErrorAt = Callable[[Array], Array]
 
@@ -202,7 +202,7 @@ class ProbeMeasurements:
         offset = (tip[:, None] - balls.centre).reshape(-1, 3)
         distance = np.sqrt((offset**2).sum(axis=1))
         normal = offset / np.maximum(distance, _SETTLED)[:, None]
-        gaps = distance - self._reach(balls, np.tile(np.arange(len(balls)), len(tip)), normal)
+        gaps = distance - self._contact_distance(balls, np.tile(np.arange(len(balls)), len(tip)), normal)
         return np.asarray(gaps.reshape(len(tip), -1).min(axis=1))
 
     def released(self, p: ArrayLike, t: float, *, balls: Balls | None = None) -> bool:
@@ -314,10 +314,10 @@ class ProbeMeasurements:
         offset = balls.centre - start
         ahead = (offset * heading).sum(axis=1)
         aside = np.sqrt(((offset - ahead[:, None] * heading) ** 2).sum(axis=1))
-        reach = balls.radius + self.probe.tip_radius + PASSING
-        return np.flatnonzero((aside <= reach) & (ahead >= -PASSING) & (ahead - reach <= length))
+        contact_distance = balls.radius + self.probe.tip_radius + PASSING
+        return np.flatnonzero((aside <= contact_distance) & (ahead >= -PASSING) & (ahead - contact_distance <= length))
 
-    def _reach(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
+    def _contact_distance(self, balls: Balls, ball: NDArray[np.intp], normal: Array) -> Array:
         """Return the distance of the tip's centre from that of a ball when the probe trips, m."""
         return np.asarray(balls.height(ball, normal) + self.probe.tip_radius - self.probe.pretravel(normal))
 
@@ -334,7 +334,8 @@ class ProbeMeasurements:
         """Return the path length of the tip along unit directions (n, 3) to the trip on a ball each (n,), m; NaN: none.
 
         It does not trip on a ball from which it moves away, and trips immediately where it touches and approaches one.
-        The error of the tip and the reach towards a ball vary by at most 1e-4 of the path: a few iterations converge.
+        The error of the tip and its distance from a ball at contact vary by at most 1e-4 of the path: a few iterations
+        converge.
         """
         centre = balls.centre[ball] + shift
         path = np.einsum("ni,ni->n", centre - start, direction)
@@ -342,8 +343,8 @@ class ProbeMeasurements:
         for _ in range(60):
             offset = start + error(start + np.where(np.isfinite(path), path, 0.0)[:, None] * direction) - centre
             along = np.einsum("ni,ni->n", offset, direction)
-            reach = self._reach(balls, ball, normal) + scatter
-            inside = along**2 - np.einsum("ni,ni->n", offset, offset) + reach**2
+            contact_distance = self._contact_distance(balls, ball, normal) + scatter
+            inside = along**2 - np.einsum("ni,ni->n", offset, offset) + contact_distance**2
             found = np.where((inside >= 0) & (along < 0), -along - np.sqrt(np.maximum(inside, 0.0)), np.nan)
             change = np.abs(found - path)
             path = found

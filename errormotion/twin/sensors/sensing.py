@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.twin import kernels
 from errormotion.twin.artefacts.bar import Bar
-from errormotion.twin.heat.state import ThermalState
 from errormotion.twin.schedule import StepProgram
 from errormotion.twin.sensors.frame import FrameGeometry
+from errormotion.twin.thermal.state import ThermalState
 
 Channels = NDArray[np.int64]
 
@@ -34,7 +34,7 @@ class _Piece:
 
     times: Array
     slow: Array
-    turns: Array
+    revolutions: Array
     pattern: Array
 
 
@@ -84,7 +84,7 @@ class Sensing:
                     rate,
                     piece.times,
                     piece.slow[chosen],
-                    piece.turns,
+                    piece.revolutions,
                     piece.pattern[chosen],
                     self.frame.noise[chosen],
                     keys,

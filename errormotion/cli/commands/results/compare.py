@@ -16,7 +16,7 @@ from errormotion.cli.output import show, show_json, table, working
 from errormotion.cli.page import Page, new_files
 from errormotion.cli.results import Loaded, load
 from errormotion.compare import compare as compared
-from errormotion.compare.ground import parts_compared
+from errormotion.compare.comparable import parts_compared
 from errormotion.compare.repeats import labels
 from errormotion.compare.text import SPREAD_HEAD, cause_text, probability, spreads, verdict, within
 from errormotion.datasets.schemas import STRAIGHTNESS_REFERENCES

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.linuxcnc import codec
 from errormotion.instruments.controller.linuxcnc.settings import LinuxCNCSettings
-from errormotion.instruments.door import Door
 from errormotion.instruments.driver import Driver
+from errormotion.instruments.interlock import Interlock
 from errormotion.instruments.nc_limits import check_program
 from errormotion.instruments.transports import Transport, open_transport
 from errormotion.instruments.transports.quiet import after_others
@@ -65,7 +65,7 @@ class LinuxCNC(Driver):
 
     def __init__(self, address: str, settings: Any = None, *, record: Any = None) -> None:
         super().__init__(address, settings, record=record)
-        self._door = Door(self.info.id, address)
+        self._interlock = Interlock(self.info.id, address)
         self._exchange_lock = threading.Lock()
         self._number = 0
         self._unawaited: set[int] = set()
@@ -89,7 +89,7 @@ class LinuxCNC(Driver):
 
     def bound(self, limits: MachineLimits) -> None:
         """Apply limits to every command from now on."""
-        self._door.limits = limits
+        self._interlock.limits = limits
 
     def read(self) -> dict[str, Any]:
         """Return the present state."""
@@ -164,9 +164,9 @@ class LinuxCNC(Driver):
             The machine is not homed, off or in e-stop, the position is out of travel; or a stop, an error of LinuxCNC
             or a lost connection ended the move. The message contains the text of LinuxCNC.
         """
-        goal, limit = self._door.position(position), self._door.limits.feed
+        goal, limit = self._interlock.position(position), self._interlock.limits.feed
         extra = {} if feed is not None or limit is None else {"feed_limit": limit}
-        feed = None if feed is None else self._door.feed(feed)
+        feed = None if feed is None else self._interlock.feed(feed)
         return dict(self._change("move_to", position=goal, feed=feed, **extra))
 
     def probe(self, target: Sequence[float], feed: float) -> dict[str, Any]:
@@ -193,7 +193,7 @@ class LinuxCNC(Driver):
         InstrumentError
             The probe is tripped before it moves; for other errors see `move_to`.
         """
-        goal, feed = self._door.position(target, "target"), self._door.feed(feed)
+        goal, feed = self._interlock.position(target, "target"), self._interlock.feed(feed)
         start = self.state()["commanded_position"] if self.settings.trip_delay else goal
         touch = codec.decode_touch(self._change("probe", target=goal, feed=feed))
         length = math.dist(goal, start)
@@ -204,7 +204,7 @@ class LinuxCNC(Driver):
 
     def spindle(self, speed: float) -> None:
         """Turn the spindle at a speed in 1/min, negative for reverse, 0 to stop it; return at once."""
-        self._change("spindle", speed=self._door.speed(speed))
+        self._change("spindle", speed=self._interlock.speed(speed))
 
     def stop(self, spindle: bool = False) -> None:
         """Abort all motion. LinuxCNC's abort stops the spindle, whatever the value of ``spindle``.
@@ -221,7 +221,7 @@ class LinuxCNC(Driver):
 
     def elapse(self, seconds: float) -> None:
         """Wait; `stop` ends this with an InstrumentError. A simulation skips the time, unless a program runs."""
-        self._send("elapse", seconds=self._door.duration(seconds))
+        self._send("elapse", seconds=self._interlock.duration(seconds))
 
     def run_program(self, text: str) -> dict[str, Any]:
         """Run an NC program; return when it has started. ``state()["running"]`` states whether it runs; `finish` waits.
@@ -233,8 +233,8 @@ class LinuxCNC(Driver):
         dict
             ``program``, the name of its file, and ``longest_lead_in``, 0 s.
         """
-        check_program(str(text), self._door)
-        extra = {"machine_coordinates": True} if self._door.limits.spans else {}
+        check_program(str(text), self._interlock)
+        extra = {"machine_coordinates": True} if self._interlock.limits.spans else {}
         *parts, last = codec.parts_of(str(text))
         for number, part in enumerate(parts):
             if number == 0:
@@ -277,7 +277,7 @@ class LinuxCNC(Driver):
     def _change(self, op: str, **arguments: Any) -> Any:
         """Send a command that moves or changes the machine."""
         words = ", ".join(f"{name} {value}" for name, value in arguments.items())
-        self._door.admit(self.settings.arm, f"{op.replace('_', ' ')} {words}")
+        self._interlock.require_armed(self.settings.arm, f"{op.replace('_', ' ')} {words}")
         return self._send(op, **arguments)
 
     def _send(self, op: str, **arguments: Any) -> Any:

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import Field
 
 from errormotion.datasets.units import Time
-from errormotion.instruments.door import ArmedSettings
+from errormotion.instruments.interlock import ArmedSettings
 
 
 class LinuxCNCSettings(ArmedSettings):

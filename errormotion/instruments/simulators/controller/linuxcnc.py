@@ -125,15 +125,15 @@ class Control:
         if world.tool != "probe":
             return {f"{PINS}{ball}.trip.in1": 0.0 for ball in range(len(balls))}
         centres = balls.centre - machine.probe_error(balls.centre, np.full(len(balls), now))
-        reach = balls.radius + machine.probe.tip_radius - machine.probe.mean
+        contact_distance = balls.radius + machine.probe.tip_radius - machine.probe.mean
         if target is not None:
             contact, distance = machine.contact(start, target, now, feed, balls=balls)
             if contact is not None and distance > 0:
                 distances = np.linalg.norm(contact - centres, axis=1)
-                nearest = int(np.argmin(np.abs(distances - reach)))
-                reach[nearest] = distances[nearest]
+                nearest = int(np.argmin(np.abs(distances - contact_distance)))
+                contact_distance[nearest] = distances[nearest]
         pins: dict[str, float] = {}
-        for ball, (centre, radius) in enumerate(zip(centres.tolist(), reach.tolist(), strict=True)):
+        for ball, (centre, radius) in enumerate(zip(centres.tolist(), contact_distance.tolist(), strict=True)):
             pins |= pin_values(ball, tuple(centre), radius, inch=self.inch)
         return pins
 

@@ -1,7 +1,7 @@
 """Files with which LinuxCNC runs a virtual machine without hardware: INI file, and the balls in HAL.
 
 The servo thread simulates the probe, after the joints: for each ball the distance of the measured position from a
-centre (``sum2``, ``hypot``) is compared with a reach (``comp``), and any of them trips the probe (``or2``).
+centre (``sum2``, ``hypot``) is compared with a contact distance (``comp``), and any of them trips the probe (``or2``).
 """
 
 from __future__ import annotations
@@ -205,9 +205,11 @@ def hal_text(balls: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def pin_values(ball: int, centre: tuple[float, float, float], reach: float, *, inch: bool = False) -> dict[str, float]:
+def pin_values(
+    ball: int, centre: tuple[float, float, float], contact_distance: float, *, inch: bool = False
+) -> dict[str, float]:
     """Return the HAL pins of a ball: its centre, and the distance from there at which the probe trips, m."""
     unit = 1000.0 / 25.4 if inch else 1000.0
     name = f"{PINS}{ball}"
     offsets = {f"{name}.{axis}.offset": -unit * x for axis, x in zip("xyz", centre, strict=True)}
-    return {**offsets, f"{name}.trip.in1": unit * reach}
+    return {**offsets, f"{name}.trip.in1": unit * contact_distance}

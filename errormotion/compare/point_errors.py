@@ -18,7 +18,7 @@ from errormotion.kinematics.twists import adjoint
 
 
 @dataclass(frozen=True)
-class Placed:
+class PointErrors:
     """Errors of one dataset at n points as arrays: values (n, 6), own (n, 6, 6), influence (source, n, 6).
 
     ``own`` is the covariance of contributions that are independent between points, without the sources.
@@ -31,7 +31,7 @@ class Placed:
     identity: list[str]
 
     @classmethod
-    def of(cls, ds: xr.Dataset) -> Placed:
+    def of(cls, ds: xr.Dataset) -> PointErrors:
         """Read a dataset with one dimension or none."""
         value = np.stack([np.asarray(ds[name].values, dtype=float) for name in DOF], axis=-1).reshape(-1, 6)
         F = influence_of(ds)
@@ -46,20 +46,20 @@ class Placed:
         """Freedoms with known values."""
         return [name for name, values in zip(DOF, self.value.T, strict=True) if np.isfinite(values).any()]
 
-    def at_times(self, time: Array, grid: Array) -> Placed:
+    def at_times(self, time: Array, grid: Array) -> PointErrors:
         """Return the errors at other times."""
         total = self.own + products(self.influence)
         E, C, F, _ = interpolated(np.asarray(time, dtype=float), self.value, total, self.influence, grid, starting=True)
         return replace(self, value=E, own=C - products(F), influence=F)
 
-    def since_first(self) -> Placed:
+    def since_first(self) -> PointErrors:
         """Return the changes since the first point."""
         total = self.own + products(self.influence)
         E, C, F, further = changes(self.value, total, self.influence, np.arange(len(self.value)) == 0)
         names, ids = [*self.source, *further], [*self.identity, *[""] * len(further)]
-        return Placed(E, C - products(F), F, names, ids)
+        return PointErrors(E, C - products(F), F, names, ids)
 
-    def times(self, A: Array) -> Placed:
+    def times(self, A: Array) -> PointErrors:
         """Return the errors multiplied by a matrix (6, 6), or by matrices (n, 6, 6).
 
         An unknown rotation counts as 0 where it acts by a lever, and makes a freedom unknown where it replaces it.
@@ -97,8 +97,8 @@ class Placed:
         return Estimate(name, self.value[:, k], self.own[:, k][:, :, k], self.influence[..., k], keys)
 
 
-def _unchanged(placed: Placed) -> Placed:
-    return placed
+def _unchanged(errors: PointErrors) -> PointErrors:
+    return errors
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Stored:
 
     Attributes
     ----------
-    placed : Placed
+    errors : PointErrors
         At the common functional point.
     shift : ndarray, (3,)
         From the functional point of the dataset to the common one, m.
@@ -121,15 +121,15 @@ class Stored:
         Removal of the reference line of a straightness, which is contained in ``finish`` or needed with ``levers``.
     """
 
-    placed: Placed
+    errors: PointErrors
     shift: Array
-    finish: Callable[[Placed], Placed] = _unchanged
+    finish: Callable[[PointErrors], PointErrors] = _unchanged
     levers: dict[str, Array] = field(default_factory=dict)
-    line: Callable[[Placed], Placed] = _unchanged
+    line: Callable[[PointErrors], PointErrors] = _unchanged
 
-    def changed(self, A: Array) -> Placed:
+    def changed(self, A: Array) -> PointErrors:
         """Return the errors on common ground if the stated ones are multiplied by matrices (6, 6) or (n, 6, 6)."""
-        return self.finish(self.placed.times(self._from_own(A)))
+        return self.finish(self.errors.times(self._from_own(A)))
 
     def values(self, A: Array) -> Array:
         """Return the values (n, 6) of `changed`."""
@@ -141,10 +141,10 @@ class Stored:
         return found
 
     @cached_property
-    def _exact(self) -> Placed:
+    def _exact(self) -> PointErrors:
         """The errors without uncertainty."""
-        each = self.placed
-        return Placed(each.value, np.zeros_like(each.own), each.influence[:0], [], [])
+        each = self.errors
+        return PointErrors(each.value, np.zeros_like(each.own), each.influence[:0], [], [])
 
     @cached_property
     def transfer(self) -> Array:

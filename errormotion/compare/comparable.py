@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.compare import chain
-from errormotion.compare.placed import Placed, Stored
+from errormotion.compare.point_errors import PointErrors, Stored
 from errormotion.compare.stack import Estimate
 from errormotion.datasets import validate
 from errormotion.datasets.results.interpolation import bracket
@@ -31,7 +31,7 @@ COORDINATES = {"position": ("x", "y", "z"), "target": ("x", "y", "z")}
 
 
 @dataclass(frozen=True)
-class Ground:
+class ComparableErrors:
     """Estimates of the same errors on one grid.
 
     Attributes
@@ -73,14 +73,14 @@ class Ground:
     stored: dict[str, Stored] = field(default_factory=dict)
 
 
-def common_ground(
+def comparable_errors(
     datasets: Mapping[str, xr.Dataset],
     *,
     at: ArrayLike | None = None,
     freedoms: Sequence[str] = (),
     since: float | None = None,
     same_start: bool = False,
-) -> Ground:
+) -> ComparableErrors:
     """Transform error datasets to common ground.
 
     Parameters
@@ -143,36 +143,36 @@ def common_ground(
     records: dict[str, xr.Dataset] = {}
     if dim == "time":
         records = _on_one_axis(moved, same_start, notes)
-        placed, grid = _in_time(records, since, notes)
+        errors, grid = _in_time(records, since, notes)
         reference = float(grid[0])
         coords = {"time": xr.DataArray(grid, dims=("time",), attrs=first["time"].attrs)}
     else:
         found = _in_place(moved, dim, notes) if dim else moved
-        placed = {name: Placed.of(ds) for name, ds in found.items()}
+        errors = {name: PointErrors.of(ds) for name, ds in found.items()}
         coords = _coordinates(next(iter(found.values())), dim)
     if stored:
-        stored |= {name: Stored(each, np.zeros(3)) for name, each in placed.items() if name not in stored}
+        stored |= {name: Stored(each, np.zeros(3)) for name, each in errors.items() if name not in stored}
     else:
-        stored = _stored(placed, datasets, point, component, coords, place)
+        stored = _stored(errors, datasets, point, component, coords, place)
         if straightened:
-            placed = {name: each.line(each.placed) for name, each in stored.items()}
+            errors = {name: each.line(each.errors) for name, each in stored.items()}
             stored = {name: replace(each, finish=each.line) for name, each in stored.items()}
             notes.append("Straightness is compared relative to the line through the first and the last position.")
-    seen = [each.seen for each in placed.values()]
+    seen = [each.seen for each in errors.values()]
     chosen = tuple(name for name in (freedoms or DOF) if all(name in each for each in seen))
     for name in freedoms:
-        for dataset, each in zip(placed, seen, strict=True):
+        for dataset, each in zip(errors, seen, strict=True):
             if name not in each:
                 raise DatasetError(
                     f"'{dataset}' does not state {name}; it states {', '.join(each) or 'nothing'}",
                     code="compare.attribute.missing",
                 )
     if not chosen:
-        states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(placed, seen, strict=True))
+        states = "; ".join(f"'{name}': {', '.join(each) or 'none'}" for name, each in zip(errors, seen, strict=True))
         raise DatasetError(f"The datasets have no freedom in common: {states}", code="compare.freedoms.none_common")
     _check_rotations(moved, chosen)
-    return Ground(
-        estimates=[each.estimate(name, chosen) for name, each in placed.items()],
+    return ComparableErrors(
+        estimates=[each.estimate(name, chosen) for name, each in errors.items()],
         dim=dim,
         coords=coords,
         freedoms=chosen,
@@ -187,7 +187,7 @@ def common_ground(
         records=records,
         labels={
             identity: source
-            for each in placed.values()
+            for each in errors.values()
             for identity, source in zip(each.identity, each.source, strict=True)
             if identity
         },
@@ -195,7 +195,7 @@ def common_ground(
 
 
 def _stored(
-    placed: Mapping[str, Placed],
+    errors: Mapping[str, PointErrors],
     datasets: Mapping[str, xr.Dataset],
     point: Array,
     component: str,
@@ -204,7 +204,7 @@ def _stored(
 ) -> dict[str, Stored]:
     """Return the errors of each dataset as a function of the errors that it states."""
     found = {}
-    for name, each in placed.items():
+    for name, each in errors.items():
         own = np.array(datasets[name].attrs["functional_point"], dtype=float)
         found[name] = Stored(each, np.zeros(3) if component == "beam" else point - own)
     if component in LINEAR_AXES and (letter := "xyz"[direction_of(component)]) in coords:
@@ -348,7 +348,7 @@ def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: li
 
 def _in_time(
     shifted: Mapping[str, xr.Dataset], since: float | None, notes: list[str]
-) -> tuple[dict[str, Placed], Array]:
+) -> tuple[dict[str, PointErrors], Array]:
     """Return the datasets at the times of the sparsest one, as changes since a common time, and these times."""
     names = list(shifted)
     known = {name: ds["time"].values[_known(ds)] for name, ds in shifted.items()}
@@ -388,14 +388,14 @@ def _in_time(
             code="compare.times.too_few",
         )
     notes.append(f"Grid: the {grid.size} times of '{sparse}'; interpolated: {', '.join(others)}.")
-    placed = {name: Placed.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
-    for name, each in placed.items():
+    errors = {name: PointErrors.of(ds).at_times(ds["time"].values, grid) for name, ds in shifted.items()}
+    for name, each in errors.items():
         if not np.isfinite(each.value[0])[np.isfinite(each.value).any(axis=0)].all():
             raise DatasetError(
                 f"'{name}': not all of its errors are known at {grid[0]:g} s, the common reference state",
                 code="compare.reference.unknown",
             )
-    return {name: each.since_first() for name, each in placed.items()}, grid
+    return {name: each.since_first() for name, each in errors.items()}, grid
 
 
 def _apart(grid: Array, times: Sequence[Array]) -> NDArray[np.bool_]:

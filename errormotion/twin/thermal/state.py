@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
-from errormotion.twin.heat.network import Ambient, LagResponse, ThermalNetwork
 from errormotion.twin.kinds import MachineKind
 from errormotion.twin.schedule import Schedule
+from errormotion.twin.thermal.network import Ambient, LagResponse, ThermalNetwork
 
 _DOF = ("EX", "EY", "EZ", "EA", "EB", "EC")
 
