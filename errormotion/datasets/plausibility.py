@@ -150,7 +150,7 @@ def _frozen(raw: xr.Dataset, variable: xr.Variable, name: str) -> Iterator[str]:
         return
 
 
-def _label(raw: xr.Dataset, dim: str, i: int) -> str:
+def _label(raw: xr.Dataset, dim: Hashable, i: int) -> str:
     """Return a text label, or the number of an index from 1 on."""
     if dim in raw.coords and raw[dim].dtype.kind in "UO":
         return str(raw[dim].values[i])

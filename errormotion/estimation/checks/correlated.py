@@ -12,8 +12,9 @@ and more for every unknown), between 0 and 1, and with a prior that draws it to 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Index, Noise, Table
-from errormotion.estimation.derivatives import column
+from errormotion.estimation.derivatives import by_rows, column
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown, linearised
 
@@ -48,8 +49,6 @@ class Correlated:
 
     Attributes
     ----------
-    fit : Fit
-        Of the differences, see `autoregressive`.
     phi, u_phi : float
         Correlation of neighbours, and its standard uncertainty.
     independent : float
@@ -58,12 +57,16 @@ class Correlated:
         Decrease of -2 log L against white noise.
     """
 
-    fit: Fit
     phi: float
     u_phi: float
     independent: float
     gain: float
-    _near: tuple[Fit, Fit, float]
+    _fitted: Callable[[float], Fit]
+
+    @cached_property
+    def fit(self) -> Fit:
+        """The fit of the differences, see `autoregressive`."""
+        return self._fitted(self.phi)
 
     def freedom_of(self, a: Array, b: Array) -> Array:
         """Return the degrees of freedom of the variances of linear functions of the unknowns, (k,).
@@ -78,13 +81,13 @@ class Correlated:
         With the variance g, ``2 / freedom = 2 / f + (d log g / d phi)^2 u(phi)^2`` (Satterthwaite), where g is that for
         the noise estimated with phi; without the first term for a stated noise.
         """
-        low, high, step = self._near
+        low = max(self.phi - _STEP, 0.0)
         logs = []
-        for each in (low, high):
+        for each in map(self._fitted, (low, low + 2 * _STEP)):
             x, z = each.normal.solve(a, b)
             g = np.einsum("rpk,rpk->k", a, x) + np.einsum("qk,qk->k", b, z)
             logs.append(np.log(g) + (0.0 if each.problem.noise.stated else np.log(each.chi2)))
-        slope = (logs[1] - logs[0]) / step
+        slope = (logs[1] - logs[0]) / (2 * _STEP)
         own = 0.0 if self.fit.problem.noise.stated else 2.0 / max(self.fit.freedom, 1)
         return np.asarray(2.0 / np.maximum(own + np.square(slope) * self.u_phi**2, 1e-12))
 
@@ -104,9 +107,10 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
         See `TYPICAL`.
     """
     problem, at = found.problem, found.linear.at
+    near = _linear(problem, at)
 
     def deviance(phi: float) -> float:
-        return _deviance(problem, at, order, series, phi) + float(np.arctanh(phi) / typical) ** 2
+        return _deviance(near, at, order, series, phi) + float(np.arctanh(phi) / typical) ** 2
 
     best = minimize_scalar(deviance, bounds=(0.0, LARGEST), method="bounded", options={"xatol": _PRECISION})
     phi = float(best.x) if best.fun < deviance(0.0) else 0.0
@@ -117,15 +121,26 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
     curvature = (values[0] - 2 * values[1] + values[2]) / _STEP**2
     n = max(int(found.linear.used.any(axis=1).sum()), 1)
     u_phi = float(np.sqrt(2.0 / max(curvature, 1e-3 * n)))
-    fits = [fit(autoregressive(problem, order, float(p), series), start=at) for p in (phi, points[0], points[2])]
     return Correlated(
-        fit=fits[0],
         phi=phi,
         u_phi=u_phi,
         independent=_independent(problem, order, series, phi),
-        gain=max(_deviance(problem, at, order, series, 0.0) - _deviance(problem, at, order, series, phi), 0.0),
-        _near=(fits[1], fits[2], 2 * _STEP),
+        gain=max(_deviance(near, at, order, series, 0.0) - _deviance(near, at, order, series, phi), 0.0),
+        _fitted=lambda its: fit(autoregressive(problem, order, its, series), start=at),
     )
+
+
+def _linear(problem: Problem, at: Unknown) -> Problem:
+    """Return a problem with its derivatives at some values, which are computed once for all correlations."""
+    if problem.derivatives is not None:
+        return problem
+    names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
+    values = [*at.tables, *problem.constant_tables(at)]
+    found = by_rows(
+        lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, range(len(names)), weighed=False
+    )
+    derivatives = dict(zip(names, found, strict=True))
+    return replace(problem, derivatives=lambda *_: derivatives)
 
 
 def autoregressive(problem: Problem, order: Array, phi: float, series: Index | None = None) -> Problem:

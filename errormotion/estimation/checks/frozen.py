@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.estimation.checks.resolution import step_of
@@ -60,7 +61,7 @@ def frozen(readings: Array) -> Frozen | None:
         Series of neighbours, of numbers or of vectors, of which all numbers must be equal; NaN is unknown.
     """
     y = readings[..., None] if readings.ndim == 2 else readings
-    known = np.isfinite(y).all(axis=2)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(y).all(axis=2))
     if known.sum() < FEWEST:
         return None
     some = y[known]
@@ -68,7 +69,7 @@ def frozen(readings: Array) -> Frozen | None:
         series, first = np.argwhere(known)[0]
         return Frozen(_number(some[0]), len(some), int(series), int(first), every=True)
     pairs = known[:, 1:] & known[:, :-1]
-    equal = pairs & np.all(y[:, 1:] == y[:, :-1], axis=2)
+    equal = pairs & np.asarray(np.all(y[:, 1:] == y[:, :-1], axis=2))
     length = np.zeros((len(y), y.shape[1]), dtype=int)  # equal pairs up to each reading
     for t in range(equal.shape[1]):
         length[:, t + 1] = np.where(equal[:, t], length[:, t] + 1, 0)
@@ -77,7 +78,7 @@ def frozen(readings: Array) -> Frozen | None:
     if longest < FEWEST - 1:
         return None
     # neighbours outside of long runs show how often they are equal
-    inside = np.zeros_like(length, dtype=bool)
+    inside = np.zeros(length.shape, dtype=bool)
     for i, t in np.argwhere(length >= FEWEST - 1):
         inside[i, t - length[i, t] : t + 1] = True
     other = pairs & ~(inside[:, 1:] & inside[:, :-1])

@@ -17,9 +17,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.signal import lfilter
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.correlated import LARGEST
+from errormotion.estimation.robust import scale_about_zero
 from errormotion.measurement import Block, Constant, Noise, Places, Problem
 from errormotion.methods.circular_test.path import DIRECTIONS, SENSE, TAU, basis, circle, over_sectors
 from errormotion.methods.circular_test.schema import READINGS
@@ -34,6 +37,10 @@ SCATTER_DEGREES = 30
 """Smallest number of degrees of freedom for an estimate of the noise of a reading."""
 FALSE_ALARM = 1e-3
 """Probability that readings with the stated noise are reported as noisier."""
+NEGLIGIBLE = 1e-3
+"""Correlation."""
+CORRELATED = 5.0
+"""Significant correlation of neighbours, times the root of the number of readings: three standard deviations."""
 
 
 class Unknowns(NamedTuple, Generic[T]):
@@ -187,12 +194,34 @@ def _xyz(array: xr.DataArray) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Sectors:
-    """The problem of the sectors; number of readings (2, place), noise of a reading, m, and whether it has a drift."""
+    """The problem of the sectors; number of readings (2, place), noise of a reading, m, and whether it has a drift.
+
+    ``order`` and ``series`` of the readings are their numbers in a circle, and the circle; ``sector`` and ``known``,
+    (2, run, sample), their sector, and whether there is a reading.
+    """
 
     problem: Problem
     count: NDArray[np.intp]
     noise: float
     drifts: bool
+    order: Array
+    series: NDArray[np.intp]
+    sector: NDArray[np.intp]
+    known: NDArray[np.bool_]
+
+    def sd(self, phi: float) -> Array:
+        """Return the standard deviations of the means over sectors, (2 place,), with a correlation of neighbours."""
+        n = self.count.ravel()
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.noise * np.sqrt((1 + (n - 1) * _shared(self.sector, self.known, phi, n.size)) / n))
+
+    def covariance(self, weights: Array, phi: float) -> Array:
+        """Return the covariance by noise of linear functions (k, 2 place) of the means over sectors, (k, k)."""
+        n = np.maximum(self.count.ravel(), 1)
+        a = np.where(self.known, (weights / n)[:, self.sector], 0.0)  # by the readings
+        # R a with R_ij = phi^|i - j| along each circle: a sum forwards and one backwards
+        forward, backward = (lfilter([1.0], [1.0, -phi], each, axis=-1) for each in (a, a[..., ::-1]))
+        return np.asarray(self.noise**2 * np.einsum("iabc,jabc->ij", a, forward + backward[..., ::-1] - a))
 
 
 def problem_of(circles: Circles, settings: Settings, places: int, decay: float, notes: list[str]) -> Sectors:
@@ -226,7 +255,10 @@ def problem_of(circles: Circles, settings: Settings, places: int, decay: float, 
             r, degrees = r - float(since @ r / spread) * time[known], degrees - 1
         else:
             notes.append("A drift of the bar is not determined: each direction of travel has only one circle.")
-    noise = _noise(circles.noise, rest(r), index, count, degrees, settings, notes)
+    circle_of, order = (i.ravel() for i in np.indices((circles.length[..., 0].size, circles.length.shape[-1])))
+    phi = _correlation(circles.deviation - at_readings)
+    shared = _shared(sector, known.reshape(sector.shape), phi, count.size)
+    noise = _noise(circles.noise, rest(r), index, count, degrees, settings, notes, shared)
 
     one = np.zeros(known.size, dtype=np.intp)
     excess = circles.radius * np.broadcast_to(circles.excess[:, :, None], circles.length.shape).ravel()
@@ -256,7 +288,16 @@ def problem_of(circles: Circles, settings: Settings, places: int, decay: float, 
         noise=Noise(sd=np.full(known.size, noise)),
         linear=True,
     )
-    return Sectors(problem, count.reshape(2, places), noise, drifts)
+    return Sectors(
+        problem,
+        count.reshape(2, places),
+        noise,
+        drifts,
+        order.astype(float),
+        circle_of,
+        sector,
+        known.reshape(sector.shape),
+    )
 
 
 def places_of(sectors: Sectors) -> Places:
@@ -273,17 +314,23 @@ def _noise(
     degrees: int,
     settings: Settings,
     notes: list[str],
+    shared: Array,
 ) -> float:
     """Return the standard deviation of a reading: as stated, or from the scatter within sectors.
 
     The scatter is the median over sectors, so that spikes and steps in a few of them are not counted as noise. A median
-    of variances scatters like the mean of a fraction 4 / pi^2 of them.
+    of variances scatters like the mean of a fraction 4 / pi^2 of them. Readings of a sector with the mean correlation c
+    agree better than independent ones: the expectation of their variance is (1 - c) times that of a reading, with the
+    freedom of n / (1 + (n - 1) c) readings.
     """
     estimated = np.nan
     if degrees >= SCATTER_DEGREES:
         many = count > 1
+        n, c = count[many], shared[many]
         squares = np.bincount(index, residual**2, minlength=len(count))[many]
-        estimated = float(np.sqrt(np.median(squares / stats.chi2.ppf(0.5, count[many] - 1))))
+        freedom = np.maximum(n / (1 + (n - 1) * c) - 1, 1) if c.any() else n - 1
+        usual = stats.chi2.ppf(0.5, freedom) / freedom * (n - 1) * (1 - c)
+        estimated = float(np.sqrt(np.median(squares / usual)))
     if not np.isfinite(stated):
         if not np.isfinite(estimated):
             raise MethodError("length_noise: expected the standard deviation of a reading; too few readings to find it")
@@ -297,6 +344,28 @@ def _noise(
             )
             return estimated
     return stated
+
+
+def _correlation(residual: Array) -> float:
+    """Return the correlation of neighbouring residuals (2, run, sample) of the path; 0 if it is not significant.
+
+    With the variances ``D_k = 2 s^2 (1 - phi^k)`` of differences of readings k apart, which no slow error of the path
+    changes, ``D_2 / D_1 = 1 + phi``.
+    """
+    one, two = (scale_about_zero(residual[..., k:] - residual[..., :-k]) ** 2 for k in (1, 2))
+    phi = min(two / one - 1.0, LARGEST) if one > 0 else 0.0
+    return phi if phi > CORRELATED / np.sqrt(max(int(np.isfinite(residual).sum()), 1)) else 0.0
+
+
+def _shared(sector: NDArray[np.intp], known: NDArray[np.bool_], phi: float, size: int) -> Array:
+    """Return the mean correlation of two readings of each sector, (2 place,)."""
+    count, pairs = np.bincount(sector[known], minlength=size), np.zeros(size)
+    for k in range(1, known.shape[-1]):
+        same = (sector[..., k:] == sector[..., :-k]) & known[..., k:] & known[..., :-k]
+        if phi**k < NEGLIGIBLE or not same.any():
+            break
+        pairs += np.bincount(sector[..., k:][same], minlength=size) * phi**k
+    return np.asarray(2 * pairs / np.maximum(count * (count - 1), 1))
 
 
 def _check_gaps(count: NDArray[np.intp], places: int, settings: Settings) -> None:

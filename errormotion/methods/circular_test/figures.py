@@ -30,6 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.estimation.checks.correlated import autoregressive
 from errormotion.estimation.extremes import FLAT, POINTED, of_noisy_values
 from errormotion.estimation.fit import fit
 from errormotion.estimation.sources import errors_of
@@ -66,8 +67,8 @@ class Figures:
     influence: dict[str, Array]
 
 
-def of_circles(circles: Circles, settings: Settings) -> Figures:
-    """Return the figures of the finest path that the readings determine.
+def of_circles(circles: Circles, settings: Settings, phi: float = 0.0) -> Figures:
+    """Return the figures of the finest path that the readings determine, with a noise of this correlation.
 
     The mean over a sector reduces a spike at a reversal, on the unsafe side. The path has therefore as many sectors as
     have about `READINGS_EACH` readings, plus the model of the path within each of them, with the decay of its spikes
@@ -78,16 +79,19 @@ def of_circles(circles: Circles, settings: Settings) -> Figures:
     decay = min(decays, key=lambda each: float(np.nansum((circles.deviation - circles.model(each)[0]) ** 2)))
     each = int(np.isfinite(circles.length).sum()) / 2 / (READINGS_EACH * settings.places)
     widths = [max(1, int(each) // part) for part in (1, 2)]
-    fine, coarse = (_of_sectors(circles, settings, settings.places * width, decay) for width in widths)
+    fine, coarse = (_of_sectors(circles, settings, settings.places * width, decay, phi) for width in widths)
     if widths[0] == widths[1]:
         return fine
     return replace(fine, covariance=fine.covariance + np.diag((fine.value - coarse.value) ** 2))
 
 
-def _of_sectors(circles: Circles, settings: Settings, places: int, decay: float) -> Figures:
+def _of_sectors(circles: Circles, settings: Settings, places: int, decay: float, phi: float) -> Figures:
     """Return the figures of means over a number of sectors plus the model of the path within them."""
     sectors = problem_of(circles, settings, places, decay, [])
-    errors = errors_of(fit(sectors.problem), places_of(sectors), shared=DRIFT)
+    problem = sectors.problem
+    if phi > 0:
+        problem = autoregressive(problem, sectors.order, phi, sectors.series)
+    errors = errors_of(fit(problem), places_of(sectors), shared=DRIFT)
     sources = sorted(errors.sources, key=lambda source: source.group == DRIFT)
     found = circles.model(decay)[1]
     within = circles.over_sectors(places * WITHIN, decay) @ found

@@ -37,7 +37,7 @@ class CircularTest(ModelMethod):
         id="circular_test",
         summary="Circular test after ISO 230-4 with a telescoping ballbar",
         status="simulated_only",
-        version="3",
+        version="4",
         former=("ballbar",),
         cannot_see=(
             "errors across the bar: only the radial displacement is measured",
@@ -78,6 +78,8 @@ class CircularTest(ModelMethod):
             # A rotation about the centre moves the ball across the bar
             sensitivity=np.tile(np.hstack([unit, np.zeros_like(unit)]), (2, 1)),
             recorded=("length", READINGS),
+            order=sectors.order,
+            series=sectors.series,
             shared=DRIFT,
             robust=False,  # a reading at a step of the path is no outlier
             noise_increases=False,  # the noise follows from the scatter within sectors already
@@ -154,20 +156,23 @@ def _finished(solved: Solved, *, circles: Circles, sectors: Sectors, settings: A
     errors, count = relative.errors, sectors.count.ravel()
     shared = np.array([each.effect[:, 0] for each in errors.sources if each.group != CENTRE]).reshape(-1, count.size)
     known = count > 0
-    with np.errstate(divide="ignore"):
-        u = sectors.noise / np.sqrt(count)
-    # Weighted least squares of the sectors: they have the circle as well, so that its datum has no effect
+    # Weighted least squares of the means over sectors: it has the circle as well, so that their datum has no effect
+    phi = observed.correlation or 0.0
+    value, u = errors.value[:, 0], sectors.sd(phi)
+    if phi > 0:  # the errors are no simple means then
+        value = np.where(known, solved.white.linear.at.tables[0][:, 0], np.nan)
     M = circles.over_sectors(settings.places, settings.spike_decay).reshape(count.size, -1)
     scale = np.linalg.norm(M[known] / u[known, None], axis=0)
     to_path = np.linalg.pinv(M[known] / u[known, None] / scale) / u[known] / scale[:, None]
-    path = to_path @ errors.value[known, 0]
-    misfit = float(np.sum(((errors.value[known, 0] - M[known] @ path) / u[known]) ** 2) / (known.sum() - M.shape[1]))
-    effect = shared[:, known] @ to_path.T
-    C = max(1.0, misfit) * (to_path * u[known] ** 2) @ to_path.T + effect.T @ effect
+    path = to_path @ value[known]
+    misfit = float(np.sum(((value[known] - M[known] @ path) / u[known]) ** 2) / (known.sum() - M.shape[1]))
+    effect, weights = shared[:, known] @ to_path.T, np.zeros((M.shape[1], count.size))
+    weights[:, known] = to_path
+    C = max(1.0, misfit) * sectors.covariance(weights, phi) + effect.T @ effect
     offset = np.linalg.pinv(M[known, :3])[1:] @ M[known] @ path
     model = np.where(known, M @ path - M[:, 1:3] @ offset, np.nan)
     noise = np.sqrt(np.maximum(errors.covariance[:, 0, 0] - np.square(shared).sum(axis=0), 0.0))
-    of_path = figures.of_circles(circles, settings)
+    of_path = figures.of_circles(circles, settings, phi)
     influence = [of_path.influence.get(each.name, np.zeros(len(figures.NAMES))) for each in errors.sources]
     drift, drift_u = _drift(solved, drifts=sectors.drifts)
     over, shape, m = ("direction_of_travel", "angle"), sectors.count.shape, {"units": "m"}

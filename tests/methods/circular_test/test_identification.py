@@ -261,3 +261,26 @@ def test_a_campaign_that_names_the_former_method_is_planned(tmp_path):
     assert test.method is CircularTest
     # 2 x 0.5 um of the bar, and little else
     assert 1.0 < 2e6 * float(np.sqrt(CircularTest().plan(test.settings)["deviation_variance"].mean())) < 1.5
+
+
+def correlated(raw, seed, phi=0.8, size=0.4e-6):
+    """Return raw data with further noise, correlated along each circle."""
+    e = np.random.default_rng([seed, 5]).standard_normal(raw["length"].shape)
+    along = np.moveaxis(e, raw["length"].dims.index("sample"), 0)
+    for k in range(1, len(along)):
+        along[k] = phi * along[k - 1] + np.sqrt(1 - phi**2) * along[k]
+    return raw.assign(length=raw["length"] + size * e)
+
+
+def test_correlated_noise_of_neighbours_is_noted_and_part_of_the_uncertainty():
+    machine = Machine()
+    for seed in range(3):
+        raw = machine.measured(SMALL, seed)
+        plain, found = (machine.identify(each, SMALL) for each in (raw, correlated(raw, seed)))
+        assert not any("correlated" in note for note in plain.em.notes)
+        assert any("neighbouring lengths is correlated (0." in note for note in found.em.notes)
+        # total noise 0.45 um; the scatter within a sector alone would be 0.34 um
+        assert 0.38e-6 < float(found["reading_noise"]) < 0.55e-6
+        # 18 readings of a sector with a correlation of 0.6 are worth about 6 independent ones; neighbours add some
+        white = float(found["reading_noise"]) / np.sqrt(found["reading_count"].values.mean())
+        assert float(found["noise_u"].mean()) > 1.3 * white
