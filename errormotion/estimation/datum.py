@@ -4,11 +4,11 @@ A datum is a few columns A (place, d, g) that are adapted to the errors with wei
 ``H = (A' w A)^-1 A' w``, and subtracted: ``e - A h``. The coefficients h are results themselves: the location errors of
 an axis of rotation, the slope of a line.
 
-The effects of sources transform linearly. The part that is independent from place to place becomes partly common: where
-few places have a weight, each of them becomes a source, which is exact. Where many have, their common effect is that of
-h, ``-A root(H D H')``, and the covariance at a place i keeps its cross terms with it,
-``D_i - D_i H_i' A_i' - A_i H_i D_i``: totals at each place are exact, covariances of two places with weight are not by
-the order of one over their number.
+The effects of sources transform linearly. The part that is independent from place to place becomes partly common: what
+it adds to h is common to all places, and a source of the datum. What it does not add to h is noise of the places. It
+stays independent where no place has more than a tenth of the weight (its leverage): the totals at each place, and the
+covariances with h, are exact, and the covariance of two such remainders, which is neglected, is below this part. Where
+few places define the datum, such as the ends of a line, the remainders are sources as well, and all of it is exact.
 """
 
 from __future__ import annotations
@@ -20,15 +20,18 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.estimation.blocks import Index
 from errormotion.estimation.sources import Errors, Source
 
 __all__ = ["Datum", "Relative", "relative"]
 
 EXACT = 256
-"""Largest number of values with a weight that become sources of their own."""
+"""Largest number of values with a weight whose noise becomes sources."""
+LEVERAGE = 0.1
+"""Part of the variance of a value, in any direction, up to which its covariance with others is neglected."""
 ROUNDING = 1e-9
 """Remainder of an effect, relative to it, that is rounding: derivatives by differences are accurate to some 1e-10."""
+
+ROUNDING_OF_VARIANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +80,15 @@ class Relative:
     influence: Array
 
 
-def relative(errors: Errors, datum: Datum) -> Relative:
+def relative(errors: Errors, datum: Datum, *, noise: str = "readings") -> Relative:
     """Return errors relative to a datum; a NaN has no weight, and stays.
+
+    Parameters
+    ----------
+    errors : Errors
+    datum : Datum
+    noise : str
+        Group of the noise of the places that define the datum, where it does not stay independent.
 
     Raises
     ------
@@ -97,57 +107,68 @@ def relative(errors: Errors, datum: Datum) -> Relative:
     H = np.einsum("gh,pdh,pd->pgd", np.linalg.inv(N)[: A.shape[2]], every, w)  # (place, g, d)
     value = np.where(known, errors.value, 0.0)
     h = np.einsum("pgd,pd->g", H, value)
-    F = np.nan_to_num(errors.influence)
-    of_h = np.einsum("pgd,spd->sg", H, F)
-    moved = [
-        replace(source, effect=_difference(source.effect, np.einsum("pdg,g->pd", A, change)))
-        for source, change in zip(errors.sources, of_h, strict=True)
-    ]
+    of_h = np.einsum("pgd,spd->sg", H, np.nan_to_num(errors.influence), optimize=True)
+    effects = _differences(errors.influence, np.einsum("pdg,sg->spd", A, of_h, optimize=True))
+    moved = [replace(source, effect=effect) for source, effect in zip(errors.sources, effects, strict=True)]
     own = np.nan_to_num(errors.own)
-    HDH = np.einsum("pgi,pij,phj->gh", H, own, H, optimize=True)
-    weighted = np.flatnonzero((w > 0).any(axis=1) & own.any(axis=(1, 2)))
-    if weighted.size * own.shape[1] <= EXACT:
-        rest, added, more = _exact(own, A, H, weighted, datum.group)
-    else:
-        rest, added, more = _common(own, A, H, HDH, datum.group)
+    rest, added, more = _noise(own, A, H, datum.group, noise)
     found = Errors(np.where(known, value - np.einsum("pdg,g->pd", A, h), np.nan), rest, [*moved, *added])
-    return Relative(found, h, HDH + of_h.T @ of_h, np.concatenate([of_h, more]))
+    influence = np.concatenate([of_h, more])
+    return Relative(found, h, influence.T @ influence, influence)
 
 
-def _exact(own: Array, A: Array, H: Array, weighted: Index, group: str) -> tuple[Array, list[Source], Array]:
-    """Return the independent part without that of the places which define the datum, and this as sources.
+def _noise(own: Array, A: Array, H: Array, group: str, noise: str) -> tuple[Array, list[Source], Array]:
+    """Return what stays independent of the noise, its common effects as sources, and their effects on h.
 
-    What does not change h, such as the errors of freedoms that the datum does not relate, stays independent.
+    With ``H D H' = R R'`` the noise is ``G x + r``: x, of unit variance, determines ``h = R x``, and the remainder r
+    has no effect on h,
+
+    G_i = D_i H_i' R^-T,    e = (G - A R) x + r,    cov(r_i, r_j) = D_i [i = j] - G_i G_j'.
     """
-    rest, added, of_h = own.copy(), list[Source](), list[Array]()
-    for place in weighted:
-        root = _root(own[place])
-        rest[place] = 0.0
-        for k in range(root.shape[1]):
-            change = H[place] @ root[:, k]
-            if not change.any():
-                rest[place] += np.outer(root[:, k], root[:, k])
-                continue
-            effect = -np.einsum("pdg,g->pd", A, change)
-            effect[place] += root[:, k]
-            if np.abs(effect).max() > 1e-9 * np.abs(root).max():
-                added.append(Source(f"{group} {len(added) + 1}", group, effect))
-                of_h.append(change)
-    return rest, added, np.array(of_h).reshape(-1, A.shape[2])
+    HDH = np.einsum("pgi,pij,phj->gh", H, own, H, optimize=True)
+    unit = np.sqrt(np.diagonal(HDH))
+    unit = np.where(unit > 0, unit, 1.0)
+    R = unit[:, None] * _root(HDH / np.outer(unit, unit))
+    if not R.size:
+        return own, [], np.zeros((0, len(HDH)))
+    G = own @ np.swapaxes(H, 1, 2) @ (np.linalg.pinv(R / unit[:, None]) / unit).T
+    common = _differences(np.moveaxis(-A @ R, 2, 0), np.moveaxis(-G, 2, 0))
+    sources = [Source(f"{group} {k + 1}", group, each) for k, each in enumerate(common)]
+    rest = _without_rounding(own - G @ np.swapaxes(G, 1, 2), own)
+    weighted = np.flatnonzero(G.any(axis=(1, 2)))
+    if weighted.size > EXACT:
+        return rest, sources, R.T
+    roots = [_root(own[place]) for place in weighted]
+    inside = [
+        np.linalg.svd(np.linalg.pinv(L) @ G[i], full_matrices=False) for i, L in zip(weighted, roots, strict=True)
+    ]
+    seen = [s > ROUNDING for _, s, _ in inside]
+    if max(float(s[0]) ** 2 for _, s, _ in inside) <= LEVERAGE or sum(int(each.sum()) for each in seen) > EXACT:
+        return rest, sources, R.T
+    # In the directions U of each place that x shares, r = L U y with the covariance 1 - B B' of y, B = U' L^-1 G.
+    B = np.concatenate([s[k, None] * V[k] for (_, s, V), k in zip(inside, seen, strict=True)])
+    along = np.linalg.qr(B, mode="complete")[0][:, R.shape[1] :]  # (N, N - r)
+    effects, first = np.zeros((along.shape[1], *own.shape[:2])), 0
+    for place, L, (U, _, _), k in zip(weighted, roots, inside, seen, strict=True):
+        LU = L @ U[:, k]
+        rest[place] = own[place] - LU @ LU.T
+        effects[:, place] = along[first : first + LU.shape[1]].T @ LU.T
+        first += LU.shape[1]
+    sources += [Source(f"{noise} of the datum {k + 1}", noise, each) for k, each in enumerate(effects)]
+    rest = _without_rounding(rest, own)
+    return rest, sources, np.concatenate([R.T, np.zeros((len(effects), len(HDH)))])
 
 
-def _common(own: Array, A: Array, H: Array, HDH: Array, group: str) -> tuple[Array, list[Source], Array]:
-    """Return the independent part with its cross terms, and the common effect of the datum on errors and on h."""
-    cross = own @ np.swapaxes(H, 1, 2) @ np.swapaxes(A, 1, 2)
-    root = _root(HDH)
-    added = [Source(f"{group} {k + 1}", group, -np.einsum("pdg,g->pd", A, root[:, k])) for k in range(root.shape[1])]
-    return own - cross - np.swapaxes(cross, 1, 2), added, root.T
+def _without_rounding(rest: Array, own: Array) -> Array:
+    """Return covariances (place, d, d) that are exactly 0 where nothing but rounding remains of ``own``."""
+    u = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    return np.asarray(np.where(np.abs(rest) <= ROUNDING_OF_VARIANCE * u[:, :, None] * u[:, None], 0.0, rest))
 
 
-def _difference(effect: Array, removed: Array) -> Array:
-    """Return the effect of a source without the part of the datum; exactly 0 where nothing but rounding remains."""
-    left = effect - removed
-    rounding = ROUNDING * float(np.nanmax(np.abs(effect), initial=0.0))
+def _differences(effects: Array, removed: Array) -> Array:
+    """Return effects of sources (s, place, d) without a part; exactly 0 where nothing but rounding remains."""
+    rounding = ROUNDING * np.abs(np.nan_to_num(effects)).max(axis=(1, 2), initial=0.0, keepdims=True)
+    left = effects - removed
     return np.asarray(np.where(np.abs(left) <= rounding, 0.0, left))
 
 

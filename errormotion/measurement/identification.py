@@ -195,7 +195,7 @@ def related(observed: Observed, errors: Errors) -> Relative:
     if observed.datum is None:
         none = np.zeros(0)
         return Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
-    return relative(errors, observed.datum)
+    return relative(errors, observed.datum, noise=observed.shared)
 
 
 def identify(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> xr.Dataset:

@@ -204,6 +204,35 @@ def test_a_datum_of_many_places_has_exact_totals() -> None:
     assert result.influence.T @ result.influence == pytest.approx(result.covariance, rel=1e-9)
 
 
+@pytest.mark.parametrize("n", [8, 20, 120, 400])
+def test_the_noise_of_places_that_define_a_datum_is_noise_of_the_readings(n: int) -> None:
+    """What a best fit absorbs of equal noise is 2 / n of its variance: the datum itself adds nothing."""
+    A = np.stack([np.ones(n), np.sqrt(2) * np.cos(np.arange(n) * 2 * np.pi / n)], axis=1)
+    before = Errors(np.zeros((n, 1)), np.full((n, 1, 1), 4.0), [])
+    result = relative(before, Datum(A[:, None, :], np.ones((n, 1)), "axis average line"), noise="readings")
+    parts = result.errors.budget()
+    assert np.abs(parts.get("axis average line", np.zeros(1))).max() < 1e-6
+    noise = np.square(parts[""]) + np.square(parts.get("readings", np.zeros((n, 1))))
+    M = np.eye(n) - A @ np.linalg.pinv(A)
+    assert noise[:, 0] == pytest.approx(4.0 * np.diag(M))
+    if n < 40:  # a place has more than a tenth of the weight
+        assert whole(result.errors) == pytest.approx(4.0 * M, abs=1e-9)
+    else:
+        assert "readings" not in parts
+    assert result.covariance == pytest.approx(4.0 * np.eye(2) / n, abs=1e-12)
+
+
+def test_a_place_that_defines_the_datum_alone_has_exactly_no_uncertainty() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((6, 2, 2))
+    before = Errors(np.zeros((6, 2)), root @ np.swapaxes(root, 1, 2), [])
+    first = np.zeros((6, 2))
+    first[0] = 1.0
+    found = relative(before, Datum(np.tile(np.eye(2), (6, 1, 1)), first, "reference")).errors
+    assert (found.covariance[0] == 0).all()
+    assert found.covariance[1:] == pytest.approx(before.own[1:] + before.own[0])
+
+
 @pytest.mark.parametrize("n", [20, 400])
 def test_the_coefficients_of_a_datum_share_the_sources_of_the_errors(n: int) -> None:
     """Covariance of errors and coefficients: that of the sources, exactly where the places are sources of their own."""
