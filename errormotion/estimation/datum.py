@@ -133,7 +133,7 @@ def _noise(own: Array, A: Array, H: Array, group: str, noise: str) -> tuple[Arra
         return own, [], np.zeros((0, len(HDH)))
     G = own @ np.swapaxes(H, 1, 2) @ (np.linalg.pinv(R / unit[:, None]) / unit).T
     common = _differences(np.moveaxis(-A @ R, 2, 0), np.moveaxis(-G, 2, 0))
-    sources = [Source(f"{group} {k + 1}", group, each) for k, each in enumerate(common)]
+    sources = [Source(f"{group} {k + 1}", group, each, joined=group) for k, each in enumerate(common)]
     rest = _without_rounding(own - G @ np.swapaxes(G, 1, 2), own)
     weighted = np.flatnonzero(G.any(axis=(1, 2)))
     if weighted.size > EXACT:
@@ -154,7 +154,10 @@ def _noise(own: Array, A: Array, H: Array, group: str, noise: str) -> tuple[Arra
         rest[place] = own[place] - LU @ LU.T
         effects[:, place] = along[first : first + LU.shape[1]].T @ LU.T
         first += LU.shape[1]
-    sources += [Source(f"{noise} of the datum {k + 1}", noise, each) for k, each in enumerate(effects)]
+    sources += [
+        Source(f"{noise} of the datum {k + 1}", noise, each, joined=f"{noise} of the datum")
+        for k, each in enumerate(effects)
+    ]
     rest = _without_rounding(rest, own)
     return rest, sources, np.concatenate([R.T, np.zeros((len(effects), len(HDH)))])
 

@@ -82,12 +82,17 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """One draw for many places: its effect (place, d) by one standard uncertainty, name, group and identity."""
+    """One draw for many places: its effect (place, d) by one standard uncertainty, name, group and identity.
+
+    Draws without a meaning of their own, such as random effects, have in ``joined`` the name under which they may be
+    replaced by fewer ones with the same covariance (`fewest`).
+    """
 
     name: str
     group: str
     effect: Array
     identity: str = ""
+    joined: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,17 +179,21 @@ def errors_of(
     if E.shape[2]:
         root = normal.root
         information = _prior(fit)
-        at = [number for *_, number in _priors(fit)]
+        words, at = _priors(fit)
         of_priors = _by_source(E @ (root @ root[at].T * np.sqrt(information[at])))
         found += [
-            Source(name, group, effect, identity)
-            for (name, group, identity, _), effect in zip(_priors(fit), of_priors, strict=True)
+            Source(name, group, effect, identity, joined)
+            for (name, group, identity, joined), effect in zip(words, of_priors, strict=True)
         ]
         K = E @ _of_readings(root, information) * np.sqrt(factor)
         if places.count == 1:
             own = own + K @ np.swapaxes(K, 1, 2)
         else:
-            found += [Source(f"{shared} {k + 1}", shared, each) for k, each in enumerate(_by_source(K)) if each.any()]
+            found += [
+                Source(f"{shared} {k + 1}", shared, each, joined=shared)
+                for k, each in enumerate(_by_source(K))
+                if each.any()
+            ]
     for k, effects in effects_of_constants(fit, tables, J, places_see):
         constant = problem.constants[k]
         names, identities = _named(constant, problem.constants._fields[k])
@@ -250,19 +259,23 @@ def _prior(fit: Fit) -> Array:
     return fit.linear.border_prior()[0]
 
 
-def _priors(fit: Fit) -> list[tuple[str, str, str, int]]:
-    """Return name, group, identity and number of every unknown of the border that has a prior."""
+def _priors(fit: Fit) -> tuple[list[tuple[str, str, str, str]], list[int]]:
+    """Return name, group, identity and ``joined``, and the number, of every unknown of the border that has a prior."""
     problem, number = fit.problem, fit.linear.numbering
-    found = []
+    words, at = [], []
     for name, block, border in zip(problem.unknowns._fields, problem.unknowns, number.border, strict=True):
         if not border.size:
             continue
+        group = block.group or name
         for row, col in np.argwhere(block.freed & (block.information > 0)):
-            found.append((f"{block.group or name} {row + 1}.{col + 1}", block.group or name, "", int(border[row, col])))
+            joined = block.component[col] if block.component else ""
+            words.append((f"{group} {row + 1}.{col + 1}", group, "", joined))
+            at.append(int(border[row, col]))
     for (k, constant), its in zip(problem.adjusted.items(), number.adjusted, strict=True):
         names, ids = _named(constant, problem.constants._fields[k])
-        found += [(name, constant.group, one, int(at)) for name, one, at in zip(names, ids, its, strict=True)]
-    return found
+        words += [(name, constant.group, one, "") for name, one in zip(names, ids, strict=True)]
+        at += its.tolist()
+    return words, at
 
 
 def _named(constant: Constant, name: str) -> tuple[Sequence[str], Sequence[str]]:

@@ -20,6 +20,7 @@ from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.datum import Relative, relative
+from errormotion.estimation.fewest import fewest
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown
 from errormotion.estimation.sources import Errors, errors_of
@@ -191,11 +192,13 @@ def _likeliest(found: Fit, suspects: Iterable[Candidate]) -> str:
 
 
 def related(observed: Observed, errors: Errors) -> Relative:
-    """Return errors relative to the datum of the model."""
+    """Return errors relative to the datum of the model, with the fewest sources."""
     if observed.datum is None:
         none = np.zeros(0)
-        return Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
-    return relative(errors, observed.datum, noise=observed.shared)
+        found = Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
+    else:
+        found = relative(errors, observed.datum, noise=observed.shared)
+    return fewest(found)
 
 
 def identify(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> xr.Dataset:

@@ -39,12 +39,11 @@ from errormotion.arrays import Array
 from errormotion.datasets.certificates import certified
 from errormotion.errors import MethodError
 from errormotion.estimation.checks.series import SIGNIFICANT, Trend, trend
-from errormotion.estimation.datum import ROUNDING
 from errormotion.estimation.problem import READINGS
 from errormotion.estimation.robust import scale_about_zero
 from errormotion.estimation.sources import Source
 from errormotion.measurement import Block, Constant, Noise, Observed, Problem
-from errormotion.methods.linear_positioning.identification.scatter import EFFECTS, EQUAL, Scatter, scatter
+from errormotion.methods.linear_positioning.identification.scatter import EQUAL, Scatter, scatter
 from errormotion.methods.linear_positioning.schema import APPROACHES
 
 if TYPE_CHECKING:
@@ -61,8 +60,6 @@ DRIFT, ALIGNMENT, LENGTH, GAIN, EXPANSION, END, NOISE = (
 """Groups of sources."""
 OF_LINE = "angle of the measured line to the axis"
 COEFFICIENT, TEMPERATURE = "coefficient of expansion", "temperature"
-NEGLIGIBLE = 1e-4
-"""Effect of a source, in standard uncertainties of the errors, that is rounding."""
 _EFFECTS = (
     "offset of the runs",
     "slope of the runs",
@@ -207,7 +204,7 @@ def problem_of(readings: Readings, spreads: Sequence[Scatter]) -> Problem:
                 free=np.tile(of_runs > 0, (runs, 1)),
                 prior=np.where(of_runs > 0, of_runs, np.inf),
                 group=DRIFT,
-                component=tuple(f"{effect} {k + 1}" for effect in EFFECTS for k in range(count)),
+                component=tuple(f"{effect}, {name}" for effect in _EFFECTS for name in readings.names),
             ),
         ),
         constants=_constants(readings, np.zeros(a.size, dtype=np.intp)),
@@ -309,7 +306,7 @@ def _name_of(readings: Readings, at: NDArray[np.intp]) -> str:
 
 
 def _finished(solved: Solved, names: Sequence[str], trends: Sequence[Trend | None]) -> Solved:
-    """Return a solution in which the runs are one source for each of their effects, and rounding is none.
+    """Return a solution with the effects of the runs first and the noise last.
 
     A trend is a further source: at any instant of the test the errors are those of its middle but for a part of the
     range, as a rectangular distribution. A straightness is relative to its ends, and has none.
@@ -319,48 +316,12 @@ def _finished(solved: Solved, names: Sequence[str], trends: Sequence[Trend | Non
     if not solved.propagated:
         return solved
     errors = solved.relative.errors
-    u = np.sqrt(np.einsum("pdd->pd", errors.covariance))
-    block = solved.fit.problem.unknowns.run
-    of_runs = [source for source in errors.sources if source.group == DRIFT]
-    column = np.argwhere(block.freed & (block.information > 0))[:, 1]
-    drift = [
-        replace(source, name=f"{_EFFECTS[k // len(names)]}, {names[k % len(names)]}{_number(i)}")
-        for k in np.unique(column)
-        for i, source in enumerate(_fewest([of_runs[j] for j in np.flatnonzero(column == k)], u))
-    ]
-    noise = _fewest([source for source in errors.sources if source.group == NOISE], u)
-    kept = [source for source in errors.sources if source.group not in (DRIFT, NOISE)]
-    found = [*drift, *kept, *(replace(source, name=f"{NOISE}{_number(i)}") for i, source in enumerate(noise))]
+    found = sorted(errors.sources, key=lambda source: {DRIFT: 0, NOISE: 2}.get(source.group, 1))
     for k, each in enumerate(trends):
         if each is not None:
             effect = np.where(np.isnan(errors.value), np.nan, 0.0)
             of_line = effect[:, k] if effect.shape[1] == len(names) else effect.reshape(len(names), -1)[k]
             of_line += each.range / np.sqrt(12.0)
             found.append(Source(f"{TREND}, {names[k]}", TREND, effect))
-    exact = [replace(source, effect=_without_rounding(source.effect)) for source in found]
-    relative = replace(solved.relative, errors=replace(errors, sources=exact))
+    relative = replace(solved.relative, errors=replace(errors, sources=found))
     return replace(solved, relative=relative, scatter=replace(solved.scatter, note=""))
-
-
-def _without_rounding(effect: Array) -> Array:
-    """Return an effect that is exactly 0 where it is rounding: a scale at the zero of the instrument."""
-    return np.where(np.abs(effect) > ROUNDING * np.nanmax(np.abs(effect), initial=0.0), effect, 0.0 * effect)
-
-
-def _number(i: int) -> str:
-    return f" {i + 1}" if i else ""
-
-
-def _fewest(sources: Sequence[Source], u: Array) -> list[Source]:
-    """Return the smallest number of sources with the same covariance, without negligible ones."""
-    if not sources:
-        return []
-    unit = np.where(u > 0, u, 1.0)
-    effects = np.array([np.nan_to_num(source.effect / unit).ravel() for source in sources])
-    seen = effects.any(axis=0)
-    _, size, rows = np.linalg.svd(effects, full_matrices=False)
-    return [
-        replace(sources[0], effect=(power * row * seen).reshape(u.shape) * unit)
-        for power, row in zip(size, rows, strict=True)
-        if power > NEGLIGIBLE
-    ]
