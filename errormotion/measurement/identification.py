@@ -20,6 +20,7 @@ from errormotion.estimation.checks.effects import information, solved
 from errormotion.estimation.checks.exclusions import Cleaned, cleaned
 from errormotion.estimation.checks.reliability import reliability
 from errormotion.estimation.datum import Relative, relative
+from errormotion.estimation.derivatives import column
 from errormotion.estimation.fewest import fewest
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem, Unknown
@@ -41,7 +42,7 @@ from errormotion.measurement.noise import (
 from errormotion.measurement.observed import Model, Observed, Solved
 from errormotion.plugins import MethodInfo
 
-__all__ = ["Solved", "dataset", "identify", "of_readings", "solve", "values_of"]
+__all__ = ["Solved", "dataset", "identify", "of_readings", "reliability_of", "solve", "values_of"]
 
 
 def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = None) -> Solved:
@@ -281,27 +282,48 @@ def values_of(solved: Solved) -> dict[str, Array]:
 
 
 def of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return residuals, exclusions and reliability of the readings, over their dims in the raw data."""
-    recorded, given = solved.observed.recorded, solved.given
-    if recorded is None or not solved.observed.reliability or solved.white.residual.size != given.readings.size:
+    """Return residuals, exclusions and reliability of the readings, over their dims in the raw data.
+
+    Without the last dim, the numbers of a reading, if a reading of several numbers has one residual.
+    """
+    recorded, given, white = solved.observed.recorded, solved.given, solved.white
+    numbers = column(given.readings)
+    single = white.residual.shape[1] == 1 and numbers.shape[1] > 1
+    if recorded is None or not solved.observed.reliability or not (single or white.residual.size == numbers.size):
         return {}
     name, dims = recorded
-    shape = tuple(raw.sizes[dim] for dim in dims)
     unit = str(raw[name].attrs.get("units", "1"))
-    found = reliability(solved.white, factor=solved.fit_factor)
-    out = np.isfinite(given.readings) & ~np.isfinite(solved.white.problem.readings)
-    residual = replace(solved.white.problem, readings=given.readings).residuals(solved.white.linear.at)
+    dims = dims[:-1] if single else dims
+    shape = tuple(raw.sizes[dim] for dim in dims)
+    out = np.isfinite(numbers) & ~np.isfinite(column(white.problem.readings))
+    residual = replace(white.problem, readings=given.readings).residuals(white.linear.at)
     parts: dict[str, tuple[Array, dict[str, str]]] = {
         "residual": (residual, {"units": unit, "long_name": "reading minus fitted, also of excluded readings"}),
+        "left_out": (out.any(axis=1) if single else out, {"long_name": "1 = excluded"}),
+    }
+    found = {
+        name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs) for name, (values, attrs) in parts.items()
+    }
+    found["left_out"] = found["left_out"].astype(np.int8)
+    return found | {
+        name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs)
+        for name, (values, attrs) in reliability_of(solved, unit).items()
+    }
+
+
+def reliability_of(solved: Solved, unit: str) -> dict[str, tuple[Array, dict[str, str]]]:
+    """Return redundancy, smallest error that is found and its effect on the result, (n, m), with their attributes."""
+    found = reliability(solved.white, factor=solved.fit_factor, pairs=False)
+    return {
         "redundancy": (found.redundancy, {"units": "1", "long_name": "share of an error that the residual shows"}),
         "smallest_error": (
             found.smallest,
             {"units": unit, "long_name": "smallest gross error that would be found with a probability of 80 %"},
         ),
-        "left_out": (out.astype(np.int8), {"long_name": "1 = excluded"}),
-    }
-    return {
-        name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs) for name, (values, attrs) in parts.items()
+        "smallest_error_effect": (
+            found.bias,
+            {"units": "1", "long_name": "largest effect of this error on any result, in its standard uncertainties"},
+        ),
     }
 
 

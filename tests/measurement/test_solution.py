@@ -5,18 +5,21 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import pytest
+import xarray as xr
+from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.estimation.blocks import Block, Constant, Noise
 from errormotion.estimation.checks.candidates import steps
-from errormotion.estimation.checks.reliability import reliability
+from errormotion.estimation.checks.exclusions import FALSE_ALARM
+from errormotion.estimation.checks.reliability import POWER, reliability
 from errormotion.estimation.fit import fit
 from errormotion.estimation.problem import Problem
 from errormotion.estimation.sources import Places
 from errormotion.measurement import Observed
-from errormotion.measurement.identification import solve
+from errormotion.measurement.identification import of_readings, solve
 from errormotion.measurement.noise import estimated_noise
 
 T = TypeVar("T")
@@ -162,3 +165,51 @@ def test_readings_that_scatter_more_than_the_stated_noise_doubt_an_uncertainty_t
     assert not follows.scatter.doubtful
     assert fixed.scatter.doubtful
     assert not solve(observed(readings(2), 0.5e-6)).scatter.doubtful
+
+
+class Circle(NamedTuple, Generic[T]):
+    circle: T
+
+
+def test_touches_with_one_residual_each_have_the_reliability_of_a_dense_calculation() -> None:
+    """Touches (x, y) of a circle: an error along the normal changes the residual, and centre and radius."""
+    rng = np.random.default_rng(8)
+    angle, sd, radius = np.array([0.0, 0.5, 1.2, 2.0, 2.2, 4.0, 5.5]), 1e-6, 0.02
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    y = radius * unit + sd * rng.standard_normal(unit.shape)
+
+    def equation(y: Array, x: Circle[Array], c: object) -> Array:
+        return np.asarray(np.linalg.norm(y - x.circle[:, :2], axis=1) - x.circle[:, 2])
+
+    start = np.array([[1e-6, 0.0, radius]])
+    block = Block(start=start, index=np.zeros(angle.size, dtype=int), scale=radius, group="circle")
+    given = Observed(
+        problem=Problem(
+            equation=equation, readings=y, reading_scale=radius, unknowns=Circle(block), noise=Noise(sd=np.full(7, sd))
+        ),
+        places=Places(lambda x, _: x.circle, 1),
+        freedoms=("EX", "EY", "EZ"),
+        dims=(),
+        coords={},
+        component="tool",
+        functional_point=(0, 0, 0),
+        reference="",
+        recorded=("touch", ("point", "direction")),
+        noise_increases=False,
+    )
+    raw = xr.Dataset({"touch": (("point", "direction"), y, {"units": "m"})})
+    found = of_readings(solve(given), raw)
+    assert {array.dims for array in found.values()} == {("point",)}
+    J = -np.column_stack([unit, np.ones(7)]) / sd
+    C = np.linalg.inv(J.T @ J)
+    r = 1 - np.einsum("ni,ij,nj->n", J, C, J)
+    delta = stats.norm.isf(FALSE_ALARM / 2 / 7) + stats.norm.ppf(POWER)
+    smallest = sd * delta / np.sqrt(r)
+    assert found["redundancy"].values == pytest.approx(r, rel=1e-3)  # the normals are those of the noisy touches
+    assert found["smallest_error"].values == pytest.approx(smallest, rel=1e-3)
+    # what each error does to centre and radius, in any direction
+    change = C @ J.T * (smallest / sd)
+    largest = np.sqrt(np.einsum("in,ij,jn->n", change, np.linalg.inv(C), change))
+    assert found["smallest_error_effect"].values == pytest.approx(largest, rel=1e-3)
+    assert np.abs(found["residual"].values).max() < 5 * sd
+    assert not found["left_out"].values.any()

@@ -82,6 +82,7 @@ def reliability(
     false_alarm: float = FALSE_ALARM,
     power: float = POWER,
     factor: float = 1.0,
+    pairs: bool = True,
 ) -> Reliability:
     """Return the reliability of a fit.
 
@@ -94,6 +95,8 @@ def reliability(
         Of the test: probability of an alarm in valid data, and of finding the smallest error.
     factor : float
         Variance factor, for an unknown noise.
+    pairs : bool
+        Whether pairs that mask one another are searched, which takes most of the time.
     """
     numbers = Numbers(fit, whole=False)
     linear = fit.linear
@@ -116,7 +119,7 @@ def reliability(
         unchecked = np.where(some, np.copysign(np.inf, per_unit), 0.0)
         effect = np.where(tested[..., None], per_unit * size, unchecked)
         effect = np.where(used[..., None], effect, np.nan)
-    masked, complete = _masked(fit, numbers)
+    masked, complete = _masked(fit, numbers) if pairs else ((), False)
     missing = np.where(used, 0.0, np.nan)
     return Reliability(r + missing, smallest + missing, bias + missing, effect, masked, complete)
 

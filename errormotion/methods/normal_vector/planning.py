@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 NOISE = 0.25e-6
 """Noise of a touch where the settings have none, m."""
 
-MEASURED = [*(name for name in RESULT if name != "normals_loss"), "cycle_time", "direction", "direction_"]
+PLANNED = ("normals_loss", "redundancy", "smallest_error", "smallest_error_effect")
+"""Further variables of a plan."""
+MEASURED = [*(name for name in RESULT if name not in PLANNED), "cycle_time", "direction", "direction_"]
 """Variables of a result that a plan has not."""
 
 _M, _S = {"units": "m"}, {"units": "s"}

@@ -16,7 +16,7 @@ from errormotion.estimation.checks.exclusions import Exclusion
 from errormotion.estimation.sources import Errors, Source
 from errormotion.estimation.variance import expansion
 from errormotion.measurement import ModelMethod, Observed
-from errormotion.measurement.identification import Solved, dataset, solve
+from errormotion.measurement.identification import Solved, dataset, reliability_of, solve
 from errormotion.methods.normal_vector import model
 from errormotion.methods.normal_vector.contradiction import contradiction
 from errormotion.methods.normal_vector.identification import normals
@@ -303,8 +303,13 @@ def _extras(
         "normals_loss": loss,
         "noise": noise,
     }
+    checked = reliability_of(solved, "m")
+    values |= {name: array.reshape(k, b, m) for name, (array, _) in checked.items()}
+    of_check = {name: attrs for name, (_, attrs) in checked.items()}
     each = EACH if probing.data.seen.touched else "direction"
     return {
-        name: xr.DataArray(values[name], dims=[each if dim == EACH else dim for dim in dims], attrs=attrs)
+        name: xr.DataArray(
+            values[name], dims=[each if dim == EACH else dim for dim in dims], attrs=attrs | of_check.get(name, {})
+        )
         for name, (dims, attrs) in RESULT.items()
     }

@@ -116,6 +116,9 @@ RESULT: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
         {"units": "m", "long_name": "apparent, since the cold cycle: opposite to the error"},
     ),
     "residual": (("time", "ball", EACH), {"units": "m", "long_name": "measured minus fitted distance"}),
+    "redundancy": (("time", "ball", EACH), {}),
+    "smallest_error": (("time", "ball", EACH), {}),
+    "smallest_error_effect": (("time", "ball", EACH), {}),
     "left_out": (
         ("time", "ball", EACH),
         {"long_name": "0 = used, 1 = missing, 2 = outlier, 3 = ball had moved, 4 = cycle not determined"},

@@ -55,7 +55,9 @@ CHAPTER = Chapter(
         Section("figures", "Figures of merit", (FigureTable(), FigureBudget())),
         Section("errors", "Error motions", (Own(_values), Curves(absent="No error is known."))),
         UNCERTAINTY,
-        Section("quality", "Data quality", (Notes(), Reliability(), Further(shown=RELIABILITY))),
+        Section(
+            "quality", "Data quality", (Notes(), Reliability(), Further(shown=(*RELIABILITY, "smallest_error_effect")))
+        ),
         PROVENANCE,
     ),
 )

@@ -9,7 +9,9 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
+from errormotion.measurement.identification import solve
 from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector.conformance import subjects
 
 METHOD = NormalVector()
 
@@ -250,3 +252,29 @@ def test_residuals_hold_no_lobing_of_the_probe(probed):
     errors = METHOD.identify(raw)
     lasting = np.nanmean(errors["residual"].values, axis=0)
     assert np.abs(lasting).max() < 0.3 * float(errors["noise"])  # 0.25 um / sqrt(13), less what is fitted
+
+
+def test_every_touch_has_its_redundancy_and_the_smallest_error_that_is_found():
+    """The redundancies add up to the degrees of freedom; an error of the smallest size moves no result by more."""
+    [subject] = subjects()
+    raw, _ = subject.make(2)
+    method, settings = NormalVector(), subject.effective_settings()
+    errors = method.identify(raw, settings)
+    used = np.isfinite(errors["redundancy"].values)
+    assert errors["redundancy"].dims == errors["residual"].dims
+    assert used.sum() == (errors["left_out"].values == 0).sum()
+    solution = solve(method.observe(raw, settings))
+    assert np.nansum(errors["redundancy"].values) == pytest.approx(solution.white.freedom, rel=1e-6)
+    k, ball, touch = 4, 1, 2
+    wrong = raw.copy(deep=True)
+    position = wrong["touch"].transpose("time", "ball", "touch", "direction")
+    along = np.mean(position.values[k, ball], axis=0) - position.values[k, ball, touch]
+    size = float(errors["smallest_error"].values[k, ball, touch])
+    position.values[k, ball, touch] += size * along / np.linalg.norm(along)
+    moved = method.identify(wrong, settings.model_copy(update={"robust": False, "noise": "stated"}))
+    plain = method.identify(raw, settings.model_copy(update={"robust": False, "noise": "stated"}))
+    change = np.asarray(moved.em.twist() - plain.em.twist())[k]
+    seen, C = np.isfinite(change), errors["covariance"].values[k]
+    effect = np.sqrt(change[seen] @ np.linalg.solve(C[np.ix_(seen, seen)], change[seen]))
+    largest = float(errors["smallest_error_effect"].values[k, ball, touch])
+    assert 0.5 * largest < effect < 1.1 * largest  # on this cycle; the largest effect is on it and on the reaches
