@@ -77,6 +77,10 @@ _EXACT = {
 }
 
 
+_SLOPES = {"mm/m": Fraction(1, 10**3), "um/m": Fraction(1, 10**6), "µm/m": Fraction(1, 10**6)}
+"""Slopes that levels and angular optics state for angles, rad; to 1 mm/m the angle differs by less than 1e-6 of it."""
+
+
 @dataclass(frozen=True)
 class Quantity:
     """Pydantic annotation of a float that has a unit.
@@ -218,6 +222,8 @@ def _linear(source: str, target: str) -> tuple[Fraction, Fraction]:
         return Fraction(1), Fraction(0)
     if target in _PER_MINUTE and source in _PER_MINUTE:
         return _PER_MINUTE[source] / _PER_MINUTE[target], Fraction(0)
+    if source in _SLOPES and _EXACT.get(target, ("",))[0] == "rad":
+        return _SLOPES[source] / _EXACT[target][1], Fraction(0)
     if source in _EXACT and target in _EXACT:
         (kind, factor), (other, unit) = _EXACT[source], _EXACT[target]
         if kind != other:

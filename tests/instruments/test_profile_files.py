@@ -145,6 +145,39 @@ def test_a_number_may_mean_a_missing_height(tmp_path: Path) -> None:
     assert found.heights == pytest.approx(1e-6 * np.array([[1, np.nan, 3], [4, 5, np.nan]]), nan_ok=True)
 
 
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+def test_a_number_for_a_missing_height_is_found_in_files_of_32_bits(tmp_path: Path, kind: str) -> None:
+    heights = np.where(np.isnan(HEIGHTS), -99.9999, 1e3 * HEIGHTS)
+    xr.Dataset(
+        {"height": (("profile", "point"), heights.astype(kind), {"units": "mm"})},
+        {"x": ("point", X, {"units": "m"}), "y": ("profile", Y, {"units": "m"})},
+    ).to_netcdf(tmp_path / "scan.nc")
+    found = scan(tmp_path / "scan.nc", MM.model_copy(update={"no_value": -99.9999}))
+    np.testing.assert_array_equal(np.isnan(found.heights), np.isnan(HEIGHTS))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "refused"),
+    [
+        ("1,-9999,3\n4,5,2\n", True),  # nines
+        ("1,-500,3\n4,5,-500\n", True),  # twice
+        ("1,999.9999,3\n4,5,2\n", True),
+        ("1,-500,3\n4,5,2\n", False),  # an outlier
+        ("1,-9.9,3\n4,5,2\n", False),
+        ("1,1,1\n1,1,2\n", False),
+    ],
+)
+def test_a_number_that_may_stand_for_no_value_is_refused_until_it_is_stated(
+    tmp_path: Path, numbers: str, refused: bool
+) -> None:
+    (tmp_path / "scan.csv").write_text(numbers)
+    if refused:
+        with pytest.raises(InstrumentError, match="far from all other heights; if it stands for no value"):
+            scan(tmp_path / "scan.csv", GRID)
+    else:
+        assert np.isfinite(scan(tmp_path / "scan.csv", GRID).heights).all()
+
+
 @pytest.mark.parametrize(
     "text", ["1,,3,\n4,5,,\n", "1,,3\n4,5,,\n", "# um\r\n1, ,3 ,\r\n\r\n4,5, , \r\n", "1,,3,,\n4,5,,,\n"]
 )

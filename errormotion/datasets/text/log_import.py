@@ -24,6 +24,7 @@ from errormotion.datasets.tables.table import Place, Table
 from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
 from errormotion.datasets.text.log_reader import NOTES, clock_notes, holes, places_of, spread
 from errormotion.datasets.text.table_reader import (
+    FREEDOM,
     Cells,
     Column,
     Found,
@@ -114,7 +115,8 @@ def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> 
         return None
     unit = row.unit if is_date(entry.unit) and row.unit == "s" else entry.unit
     where = f"columns.{key}"
-    if converted(np.ones(1), unit, row, f"{where}.unit", 0, mistakes) is None:
+    freedom = label if dim == FREEDOM else ""
+    if converted(np.ones(1), unit, row, f"{where}.unit", 0, mistakes, freedom) is None:
         return None
     offset = _quantity(entry.offset, row, f"{where}.offset", mistakes) if entry.offset else 0.0
     component = labels.index(label) if dot else None

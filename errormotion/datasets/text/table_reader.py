@@ -16,6 +16,11 @@ from errormotion.datasets.schemas import RawSchema, Row
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
+from errormotion.kinematics.iso import DOF
+from errormotion.kinematics.volumes import is_rotation
+
+FREEDOM = "freedom"
+"""Dimension of errors that are lengths or angles."""
 
 
 @dataclass(frozen=True)
@@ -143,14 +148,31 @@ def units_of(row: Row) -> dict[str, str]:
     return {"units": row.unit} if row.unit else {}
 
 
-def converted(values: Array, unit: str, row: Row, place: str, line: int, mistakes: Mistakes) -> Array | None:
-    """Return values in the unit of the schema; None and a mistake if that is not possible."""
+def unit_of_freedom(row: Row, freedom: str) -> str:
+    """Return the unit of a variable for an error such as EXX, m or rad; empty if the name does not decide.
+
+    The names are those of ISO 230-1: EA, EB and EC are rotations.
+    """
+    if freedom[:2] not in DOF or not {"m", "rad"} <= set(row.units):
+        return ""
+    return "rad" if is_rotation(freedom) else "m"
+
+
+def converted(
+    values: Array, unit: str, row: Row, place: str, line: int, mistakes: Mistakes, freedom: str = ""
+) -> Array | None:
+    """Return values in the unit of the schema; None and a mistake if that is not possible.
+
+    ``freedom`` is the error of these values, where its kind decides between lengths and angles.
+    """
     if row.unit in ("", "1") and unit in ("", "1"):
         return values
     if not unit:
         mistakes.add(line, f"{place}: expected a unit, such as {row.unit}; found none")
         return None
-    inside = row.units or (row.unit or "1",)
+    decided = unit_of_freedom(row, freedom)
+    inside = (decided,) if decided else row.units or (row.unit or "1",)
+    place = f"{place}: {freedom}" if decided else place
     reasons = []
     for goal in inside:
         try:
@@ -231,7 +253,10 @@ def read_table(
     arrays: dict[str, Array] = {}
     for number, column in columns.items():
         row, component, title = column.row, column.component, f"column '{titles[number]}'"
-        inside = converted(table.numbers[number], column.unit, row, title, line, mistakes)
+        freedom = _freedom(table, row, component, keys, names, title, mistakes)
+        if freedom is None:
+            continue
+        inside = converted(table.numbers[number], column.unit, row, title, line, mistakes, freedom)
         if inside is None:
             continue
         with np.errstate(over="ignore"):  # infinite values are refused as implausible
@@ -283,6 +308,27 @@ def incomplete(columns: Mapping[int, Column], keys: Mapping[str, int], names: Na
         return
     yield from (f"expected a column '{dim}' (number or name, without unit)" for dim in record[:-1] if dim not in keys)
     yield from (f"column '{dim}': no variable of this table has this dimension" for dim in keys if dim not in record)
+
+
+def _freedom(
+    table: Cells, row: Row, component: int | None, keys: Mapping[str, int], names: Names, title: str, mistakes: Mistakes
+) -> str | None:
+    """Return an error of a column whose kind decides on the unit; empty for none, None and a mistake for both kinds."""
+    if component is not None and names.component_dim(row) == FREEDOM:
+        return names.labels[FREEDOM][component]
+    if FREEDOM not in row.dims or FREEDOM not in keys:
+        return ""
+    labels = table.texts[keys[FREEDOM]]
+    first: dict[str, int] = {}
+    for k, label in enumerate(labels):
+        first.setdefault(unit_of_freedom(row, label), k)
+    if len(first) > 1:
+        m, rad = (f"{labels[k]} in line {table.lines[k]}" for _, k in sorted(first.items()))
+        mistakes.add(
+            table.head[0], f"{title}: expected lengths and angles in columns or tables of their own; found {m}, {rad}"
+        )
+        return None
+    return next((labels[k] for k in first.values()), "")
 
 
 def _require_rows(table: Cells, columns: Mapping[int, Column], mistakes: Mistakes) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +22,7 @@ from pydantic import AfterValidator, Field
 
 from errormotion.datasets.files.reading import read_bytes
 from errormotion.datasets.files.tomlfile import load_model
+from errormotion.datasets.tables.encoding import decode
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
@@ -86,9 +87,11 @@ def read_rtl(log: Path, map_file: Path) -> xr.Dataset:
     _check_count(sections.get("RUNS", []), len(runs), mistakes)
     mistakes.raise_any()
     freedom = stated.freedom or FREEDOMS["XYZ".index(stated.axis)]
+    _check_owner(log, _stated(sections.get("HEADER", []), "owner"), stated, freedom)
     size = convert(1.0, stated.deviation_unit, "m" if freedom in FREEDOMS[:3] else "rad")
-    values = np.full((max(map(len, passes)), 2, len(targets)), np.nan)
-    for k, one_direction in enumerate(passes):
+    measured = [k for k, one_direction in enumerate(passes) if one_direction]  # one direction alone is a test as well
+    values = np.full((max(map(len, passes)), len(measured), len(targets)), np.nan)
+    for k, one_direction in enumerate(passes[k] for k in measured):
         for number, row in enumerate(one_direction):
             values[number, k, list(row)] = [stated.scale * size * value for value in row.values()]
     variables: dict[str, tuple[Any, ...]] = {
@@ -105,7 +108,34 @@ def read_rtl(log: Path, map_file: Path) -> xr.Dataset:
         "machine": stated.machine or _stated(sections.get("USER-TEXT", []), "machine") or "unknown",
         "missing_values": json.dumps({"deviation": missing} if missing else {}),
     }
-    return xr.Dataset(variables, {"freedom": [iso_names(stated.axis)[freedom]], "approach": list(APPROACHES)}, attrs)
+    return xr.Dataset(
+        variables, {"freedom": [iso_names(stated.axis)[freedom]], "approach": [APPROACHES[k] for k in measured]}, attrs
+    )
+
+
+def _check_owner(log: Path, owner: str, stated: RtlMap, freedom: str) -> None:
+    """Raise DatasetError if the file contains another quantity than the freedom of the map, or one of a rotary axis.
+
+    The owner names the measurement of the software: Linear, Angular, Straightness, Squareness, Rotary.
+    """
+    own = "XYZ".index(stated.axis)
+    kinds: dict[str, Sequence[str]] = {
+        "linear": FREEDOMS[own : own + 1],
+        "angular": FREEDOMS[3:],
+        "straightness": [each for k, each in enumerate(FREEDOMS[:3]) if k != own],
+    }
+    names, kind = iso_names(stated.axis), owner.lower()
+    if kind in ("rotary", "squareness"):
+        raise DatasetError(
+            f"{log}: Owner: expected Linear, Angular or Straightness; found {owner}, no error of a linear axis",
+            code="rtl.owner.other",
+        )
+    if kind in kinds and freedom not in kinds[kind]:
+        expected = " or ".join(kinds[kind])
+        raise DatasetError(
+            f"{log}: Owner: found {owner}, but {names[freedom]} in the map; set freedom to {expected}, and its unit",
+            code="rtl.owner.other",
+        )
 
 
 LOG_READERS = {MAP_SCHEMA: read_rtl}
@@ -119,10 +149,7 @@ def _text(log: Path) -> str:
         data = read_bytes(log, MAX_FILE_SIZE)
     except OSError as error:
         raise DatasetError(f"{log} cannot be read: {error.strerror or error}") from None
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")  # only the user's text contains characters other than ASCII
+    return decode(data, "auto", log)[0]
 
 
 def _sections(text: str) -> dict[str, Lines]:

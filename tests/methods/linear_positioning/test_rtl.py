@@ -74,9 +74,47 @@ def test_runs_become_approaches_with_their_positions_and_units(imported):
 
 
 def test_units_scale_and_freedom_are_those_of_the_map(imported):
-    raw = imported(text(), MAP + 'deviation_unit = "arcsec"\nscale = -1\nfreedom = "EX"\n'.replace("EX", "EA"))
+    raw = imported(
+        text().replace("Linear", "Angular"),
+        MAP + 'deviation_unit = "arcsec"\nscale = -1\nfreedom = "EX"\n'.replace("EX", "EA"),
+    )
     assert raw["freedom"].values.tolist() == ["EAY"]
     assert float(raw["deviation"][0, 0, 0, 0]) == pytest.approx(-deviation(1, 1) * np.pi / 648000)
+
+
+@pytest.mark.parametrize(
+    ("owner", "freedom", "said"),
+    [
+        ("Angular", "", "found Angular, but EYY in the map; set freedom to EA or EB or EC"),
+        ("Straightness", "", "found Straightness, but EYY in the map; set freedom to EX or EZ"),
+        ("Linear", "EA", "found Linear, but EAY in the map; set freedom to EY"),
+        ("Rotary", "", "found Rotary, no error of a linear axis"),
+        ("Squareness", "EX", "found Squareness, no error of a linear axis"),
+    ],
+)
+def test_another_quantity_than_that_of_the_map_is_refused(imported, owner: str, freedom: str, said: str) -> None:
+    with pytest.raises(DatasetError, match=said):
+        imported(text().replace("Linear", owner), MAP + (f'freedom = "{freedom}"\n' if freedom else ""))
+
+
+def test_a_test_of_one_direction_has_no_missing_readings(imported) -> None:
+    head, _, rest = text().partition("Run Target Data:\r\n")
+    lines = "".join(f"{run} {k} {deviation(2 * run - 1, k)}\r\n" for run in range(1, 6) for k in range(1, 8))
+    raw = imported(
+        head.replace("Run-count:8", "Run-count:5") + "Run Target Data:\r\n" + lines + rest[rest.index("\r\nEQUIP") :]
+    )
+    assert raw["approach"].values.tolist() == ["forward"]
+    assert raw.attrs["missing_values"] == "{}"
+    notes = " ".join(LinearPositioning().identify(raw, Settings(axis="Y", trials=200)).em.notes)
+    assert "missing" not in notes
+    assert "approached forward only" in notes
+
+
+def test_a_name_in_another_encoding_is_read(imported) -> None:
+    assert (
+        imported(text().replace("M\u00fchle 7", "\u78e8\u5e8a\u4e00\u53f7\u673a").encode("gb18030")).attrs["machine"]
+        == "\u78e8\u5e8a\u4e00\u53f7\u673a"
+    )
 
 
 def test_targets_that_a_run_has_not_reached_are_unknown(imported):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from errormotion.plugins.readings import Scan
 Array = np.ndarray[Any, Any]
 
 MAX_HEIGHT = 0.5  # m; a larger one indicates a wrong unit
+_FAR = 10.0
+"""Distance of a number from all heights, in ranges of these, from which it is taken for no value."""
+_NINES = re.compile(r"-?9{3,}(?:\.9*)?|-?9{2,}\.9{2,}|-?32768")
 FULL = 0.25
 """Smallest fraction of the cells of a height map that a point cloud must fill."""
 
@@ -67,8 +71,29 @@ def _unit(path: Path, settings: ProfileFileSettings) -> str:
     return settings.unit
 
 
-def _with_nan(values: Array, settings: ProfileFileSettings) -> Array:
-    return values if settings.no_value is None else np.where(values == settings.no_value, np.nan, values)
+def _with_nan(values: Array, settings: ProfileFileSettings, path: Path) -> Array:
+    """Return heights with NaN for no value, in the unit of the file; files of 32 bits have the nearest such number.
+
+    Raises
+    ------
+    InstrumentError
+        A number that instruments write for no value stands far from all heights, and the settings do not state it.
+    """
+    if settings.no_value is not None:
+        stated = (settings.no_value, float(np.float32(settings.no_value)))
+        return np.where(np.isin(values, stated), np.nan, values)
+    known = np.unique(values[np.isfinite(values)])
+    for extreme, rest in ((known[:1], known[1:]), (known[-1:], known[:-1])):
+        # Such a number lies outside of the heights by many times their range, and repeats or has only nines.
+        if rest.size < 2 or np.abs(extreme - rest).min() < _FAR * np.ptp(rest):
+            continue
+        number = float(np.float32(extreme[0]))
+        if (values == extreme[0]).sum() > 1 or _NINES.fullmatch(f"{number:.7g}"):
+            raise InstrumentError(
+                f"{path}: {number:.7g} is far from all other heights; if it stands for no value, set 'no_value'",
+                code="scans.no_value",
+            )
+    return values
 
 
 def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, Array]:
@@ -79,7 +104,7 @@ def _read_csv(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
             f"{path} only has heights: set 'x_pitch' and 'y_pitch', the distances of its columns and rows",
             code="scans.pitch.missing",
         )
-    heights = _in_metres(_with_nan(_csv_rows(path, settings.delimiter), settings), unit)
+    heights = _in_metres(_with_nan(_csv_rows(path, settings.delimiter), settings, path), unit)
     n, points = heights.shape
     return heights, settings.x_pitch * np.arange(points), settings.y_pitch * np.arange(n)
 
@@ -148,7 +173,7 @@ def _read_netcdf(path: Path, settings: ProfileFileSettings) -> tuple[Array, Arra
         if variable.dtype.kind not in "iuf":
             raise InstrumentError(f"{path}: the variable {name} is not numeric", code="scans.variable.type")
         values = np.asarray(variable.values, dtype=np.float64)
-        found.append(_in_metres(_with_nan(values, settings) if name == "height" else values, unit))
+        found.append(_in_metres(_with_nan(values, settings, path) if name == "height" else values, unit))
     heights, x, y = found
     return heights, x, y
 
@@ -165,7 +190,7 @@ def _read_cloud(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array
             f"{path} cannot be read: Open3D found no points. Check that the file is complete", code="scans.file.damaged"
         )
     points = cloud.point.positions.numpy().astype(np.float64)
-    points[:, 2] = _with_nan(points[:, 2], settings)
+    points[:, 2] = _with_nan(points[:, 2], settings, path)
     return height_map(_in_metres(points, unit), path)
 
 
@@ -184,7 +209,7 @@ def _read_xyz(path: Path, settings: ProfileFileSettings) -> tuple[Array, Array, 
         points = np.empty((0, 0))
     if points.shape[1:] != (3,):
         raise InstrumentError(f"{path}, {_first_mistake(lines)}", code="scans.line.form")
-    points[:, 2] = _with_nan(points[:, 2], settings)
+    points[:, 2] = _with_nan(points[:, 2], settings, path)
     return height_map(_in_metres(points, unit), path)
 
 
