@@ -5,6 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.stats import chi2, kstest, ncx2
 
 from errormotion import datasets
@@ -213,12 +214,12 @@ def test_incomparable_datasets_are_reported(changed, message):
 def test_one_dataset_twice_one_alone_and_other_dims_are_refused():
     rng = np.random.default_rng(9)
     ds = made(T1, rng)
-    with pytest.raises(DatasetError, match="the same dataset"):
+    with raises("compare.dataset.same"):
         compare({"a": ds, "b": ds.copy()})
-    with pytest.raises(DatasetError, match="at least two"):
+    with raises("compare.datasets.too_few"):
         compare({"a": ds})
     single = ds.em.mean("time")
-    with pytest.raises(DatasetError, match="depend on different dimensions"):
+    with raises("compare.dims.differ"):
         compare({"a": ds, "b": single})
     assert compare({"a": ds, "b": made(T2, rng, start="", name="b")}, same_start=True)["p"].item() > 1e-4
 

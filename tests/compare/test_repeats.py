@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 from typer.testing import CliRunner
 
 from errormotion import datasets
@@ -53,7 +54,7 @@ def test_without_repeats_in_a_group_only_the_sum_is_known_and_without_groups_onl
     one = repeats(estimates([1.0, 2.0, 4.0]), ["a"] * 3)
     assert one.value[0, 0] == pytest.approx(np.std([1.0, 2.0, 4.0], ddof=1))
     assert np.isnan(one.value[1:, 0]).all()
-    with pytest.raises(DatasetError, match="at least two datasets"):
+    with raises("repeats.too_few"):
         repeats(estimates([1.0]), ["a"])
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import table_readers
 import xarray as xr
+from coded import raises
 
 from errormotion.compensation.tables import (
     AxisTable,
@@ -217,14 +218,14 @@ def test_fanuc_rejects_values_out_of_range(machine: VirtualMachine) -> None:
         DatasetError, match=r"changes by 1[45]\d\d\.\d um between two points; FANUC accepts at most 700 um"
     ):
         export(axis_table(steep(machine), "Y", step=0.05), get("fanuc"))
-    with pytest.raises(DatasetError, match="reference point at position 0, which is not a point"):
+    with raises("table.reference.no_point"):
         export(axis_table(measured(machine, count=32), "Y"), get("fanuc"))
 
 
 def test_uneven_positions_require_a_step(machine: VirtualMachine) -> None:
     ds = measured(machine).isel(position=[0, 1, 3, 7, 16, 20, 32])
     for form in ("siemens", "fanuc"):
-        with pytest.raises(DatasetError, match="points at equal distances"):
+        with raises("table.points.not_equidistant"):
             export(axis_table(ds, "Y"), get(form))
     assert export(axis_table(ds, "Y"), get("linuxcnc")).points == 7
 
@@ -274,7 +275,7 @@ def test_files_that_exist_are_kept(machine: VirtualMachine, tmp_path: Path) -> N
     first = exported.save(tmp_path / "tables")
     first[1].unlink()
     before = first[0].read_bytes()
-    with pytest.raises(DatasetError, match="already exists"):
+    with raises("table.file.exists"):
         exported.save(tmp_path / "tables")
     assert first[0].read_bytes() == before
     assert not first[1].exists()

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -226,7 +227,7 @@ def test_a_missing_calibration_is_reported_with_the_searched_folders(
     good: InclinationCalibration, folders: Path
 ) -> None:
     good.save(folders / "bench" / "calibrations" / "left.nc")
-    with pytest.raises(DatasetError, match="not found") as reported:
+    with raises("calibration.not_found") as reported:
         InclinationCalibration.find("right", folders / "bench")
     message = str(reported.value)
     assert str(folders / "bench" / "calibrations" / "right.nc") in message

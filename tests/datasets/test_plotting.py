@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
@@ -111,7 +112,7 @@ def test_flat_axes_show_bars_at_targets_and_arrows_need_space(errors) -> None:
     axes = Figure().subplots()
     ds.em.plot(ax=axes)
     assert [tick.get_text() for tick in axes.get_xticklabels()] == [f"T{k}" for k in range(8)]
-    with pytest.raises(DatasetError, match="projection"):
+    with raises("plot.axes.projection"):
         ds.em.plot(ax=axes, form="arrows")
 
 

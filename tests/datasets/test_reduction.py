@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets
 from errormotion.datasets.timing import between, later
@@ -171,5 +172,5 @@ def test_instants():
     assert later("2026-03-01T09:00:00+01:00", 1.5) == "2026-03-01T08:00:01.500000+00:00"
     assert later("", 1.0) == ""
     assert between("2026-03-01T09:00:00+01:00", "2026-03-01T08:00:10+00:00") == 10
-    with pytest.raises(DatasetError, match="expected an instant"):
+    with raises("time.start.form"):
         later("2026-03-01T09:00:00", 0.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from coded import raises
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, TransposeCodec, ZstdCodec
 
 from errormotion.datasets import load
@@ -154,7 +155,7 @@ def test_texts_come_back_and_damaged_ones_are_refused(tmp_path) -> None:
     longer, other = content[:4] + b"\xff" + content[5:], content[:9] + b"\xff" + content[10:]
     for damaged in (b"", content[:-3], b"\x05" + content[1:], longer, other):
         chunk.write_bytes(damaged)
-        with pytest.raises(DatasetError, match=r"is damaged or incomplete"):
+        with raises("file.damaged"):
             load(path)
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coded import raises
 from typer.testing import CliRunner, Result
 
 from errormotion.cli.app import app
 from errormotion.datasets.files import events
-from errormotion.errors import RunError
 from errormotion.record.runs import listing
 
 
@@ -151,7 +151,7 @@ def test_a_file_that_is_too_large_is_not_read_and_not_extended(tmp_path: Path) -
     line = json.dumps({"text": "x" * 900, "noted": "2026-03-01T08:00:00"}) + "\n"
     (tmp_path / "events.jsonl").write_text(line * (events.MAX_FILE // len(line)))
     assert len(events.read(tmp_path)[0]) > 1000
-    with pytest.raises(RunError, match="the note does not fit"):
+    with raises("event.file.full"):
         events.append(tmp_path, events.event("x" * 1000))
     (tmp_path / "events.jsonl").write_text(line * (events.MAX_FILE // len(line) + 1))
     assert "it is larger" in events.read(tmp_path)[1][0]

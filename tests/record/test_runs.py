@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from coded import raises
 from typer.testing import CliRunner, Result
 
 from errormotion import datasets
 from errormotion.campaign import folder as run_folder
 from errormotion.cli.app import app
 from errormotion.datasets import provenance
-from errormotion.errors import RunError
 from errormotion.record.runs import entry, index, listing
 
 LONG_AGO = 1_700_000_000_000_000_000
@@ -230,7 +230,7 @@ def test_folders_of_folders_and_single_runs_are_found_once(tmp_path: Path) -> No
     assert len(listing.list_runs([tmp_path / "lab"]).runs) == 2
     assert len(listing.list_runs([path]).runs) == 1
     assert len(listing.list_runs([path, tmp_path / "lab"]).runs) == 2
-    with pytest.raises(RunError, match="no such folder"):
+    with raises("run.folder.not_found"):
         listing.list_runs([tmp_path / "nowhere"])
 
 

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+from coded import raises
 
 from errormotion import plugins
 from errormotion.errors import PluginError
@@ -65,7 +66,7 @@ def test_a_plugin_states_its_subjects(registered, tmp_path, monkeypatch):
 
 def test_a_method_without_subjects_is_reported_with_a_remedy(registered):
     registered(info=MethodInfo("mine", "", "simulated_only"))
-    with pytest.raises(PluginError, match="conformance = 'module:name'"):
+    with raises("check.subject.missing"):
         subjects_of("methods", "mine")
 
 
@@ -78,7 +79,7 @@ def test_a_method_with_the_base_class_may_state_no_subject_or_a_method_that_make
             return (MethodSubject(type(self), None, {}),)
 
     monkeypatch.setattr(plugins, "get", lambda group, plugin_id: Bare)
-    with pytest.raises(PluginError, match="conformance = 'module:name'"):
+    with raises("check.subject.missing"):
         subjects_of("methods", "mine")
     monkeypatch.setattr(plugins, "get", lambda group, plugin_id: Own)
     assert [subject.plugin for subject in subjects_of("methods", "mine")] == [Own]
@@ -86,7 +87,7 @@ def test_a_method_with_the_base_class_may_state_no_subject_or_a_method_that_make
 
 def test_an_instrument_without_simulator_needs_an_address(registered):
     registered(info=InstrumentInfo("mine", "point_lds", "", "hardware_verified"))
-    with pytest.raises(PluginError, match="give the address of a real one"):
+    with raises("check.simulator.missing"):
         subjects_of("instruments", "mine")
     (subject,) = subjects_of("instruments", "mine", address="tcp://127.0.0.1:9")
     assert not subject.simulated

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import Field
 
 from errormotion.datasets.units import Time
@@ -303,7 +304,7 @@ def test_a_device_that_does_not_stop_sending_is_an_error() -> None:
     with Asking(ADDRESS, DialSettings(timeout=0.2)) as dial:
         with pytest.raises(ProtocolError):
             dial.read()
-        with pytest.raises(ProtocolError, match="without a request"):
+        with raises("protocol.unrequested"):
             dial.read()
 
 

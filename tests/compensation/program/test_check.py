@@ -8,6 +8,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from coded import raises
 from nc_controls import Reading, control
 from nc_paths import ORIGINS, field, rewritten
 from nc_programs import Programs
@@ -111,7 +112,7 @@ def test_a_changed_cut_is_found(change: tuple[str, str]) -> None:
     lines = [*HEAD, "G1 X10", "G1 Y20", "G3 X10 Y10 J-5", "G1 Y20", "G2 X10 Y20 I3 P2", "G1 Z5", "X20", "M2"]
     text = "\n".join(lines)
     assert paths.compare(lines, lines, ORIGINS, 1e-6) == 7
-    with pytest.raises(ProgramError, match="the new program"):
+    with raises("program.cut.differs"):
         paths.compare(lines, text.replace(*change).split("\n"), ORIGINS, 1e-6)
 
 

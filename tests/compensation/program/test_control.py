@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from nc_paths import moves_of, zero
 
 from errormotion.compensation.program.compensating import Settings, compensate
@@ -131,7 +132,7 @@ def test_a_value_that_nothing_states_is_refused_by_name(lines: list[str], name: 
 @needs_linuxcnc
 @pytest.mark.parametrize("line", ["G1 X#5400", "G1 X#5410", "G1 X#<_current_tool>", "G41 G1 X10"])
 def test_the_tool_in_the_spindle_is_unknown_before_it_is_changed(line: str, tmp_path: Path) -> None:
-    with pytest.raises(ProgramError, match="neither the inputs nor the program state"):
+    with raises("program.parameter.unknown"):
         ends(["G21 G90 G54 G40 F100", "G0 X0 Y0 Z0", line, "G1 X20", "M2"], stated(tmp_path))
 
 
@@ -186,7 +187,7 @@ def test_the_interpreter_restores_the_stored_offset_as_well(tmp_path: Path) -> N
 
 def test_an_active_offset_of_which_an_axis_is_not_stated_is_unknown(tmp_path: Path) -> None:
     offsets = control(tmp_path, parameters=STATED.replace("5210 0", "5210 1").replace("5212 8\n", ""))
-    with pytest.raises(ProgramError, match="unknown position"):
+    with raises("program.position.unknown"):
         list(Reader(offsets).items(["G21 G90 G54", "G0 X0 Y0 Z0", "G1 X1 F100"]))
 
 
@@ -213,5 +214,5 @@ def test_parameters_that_the_control_keeps_and_the_new_program_does_not_set_are_
 def test_a_long_line_whose_parameters_are_known_is_read(tmp_path: Path) -> None:
     line = f"G1 X#150 ({'x' * 225})"
     assert ends([*HEAD, line, "M2"], control(tmp_path))[0][0] == pytest.approx(12.5)
-    with pytest.raises(ProgramError, match="too many parameters in one line"):
+    with raises("program.parameters.too_many"):
         ends([*HEAD, "G1 X[" + "+".join(f"#{k}" for k in range(40, 60)) + "]", "M2"], control(tmp_path))

@@ -7,6 +7,7 @@ from random import Random
 
 import numpy as np
 import pytest
+from coded import raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nc_paths import ORIGINS, deviations, field, moves_of, rewritten, zero
@@ -189,7 +190,7 @@ def test_positions_outside_the_measured_range_are_counted() -> None:
 
 
 def test_unknown_corrections_are_an_error() -> None:
-    with pytest.raises(ProgramError, match="unknown"):
+    with raises("program.correction.unknown"):
         rewritten([*HEAD, "G1 X1"], field(lambda p: np.full_like(p, np.nan)))
 
 
@@ -202,7 +203,7 @@ def test_invalid_settings_are_an_error(wrong: dict[str, float]) -> None:
 def test_too_many_pieces_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dividing, "MAX_PIECES", 50)
     noise = field(lambda p: 1e-3 * np.sin(p * 1e7))
-    with pytest.raises(ProgramError, match="at most"):
+    with raises("program.points.too_many"):
         rewritten([*HEAD, "G2 X0 I0.1"], noise, tolerance=1e-8, step=1e-5)
 
 
