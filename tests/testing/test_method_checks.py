@@ -417,6 +417,17 @@ def test_a_method_with_honest_figures_passes():
     assert run_check(check, SOUND).skipped
 
 
+def test_a_procedure_of_which_nothing_is_expected_has_no_plan_to_compare():
+    class ExpectsNothing(Sound):
+        def expected(self, settings):
+            raise NotImplementedError("this procedure has no expected raw data")
+
+    check = next(check for check in METHOD_CHECKS if check.name == "plan_agrees")
+    result = run_check(check, replace(SOUND, plugin=ExpectsNothing))
+    assert result.skipped
+    assert "this procedure has no expected raw data" in result.message
+
+
 def test_for_every_check_a_plugin_fails():
     assert {check for check, _ in BROKEN} == {check.name for check in METHOD_CHECKS}
 

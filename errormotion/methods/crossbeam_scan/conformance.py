@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.crossbeam_scan.method import CrossbeamScan
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.methods.crossbeam_scan.simulation import POSITIONS, simulate
@@ -14,14 +15,15 @@ NOMINAL_LIFT = -0.17
 
 
 def subjects() -> tuple[MethodSubject, ...]:
-    """Return the two procedures: a cold and a warm scan of three artefacts, and the pose of the profiler.
+    """Return a cold and a warm scan of three artefacts, the pose of the profiler, and registrations.
 
-    Both have an eighth of the points of a real profiler, those of the scans at twice their distance. The axis is Y of
-    every frame: the frame of the scans is turned about Y, that of the pocket not at all.
+    The first two have an eighth of the points of a real profiler, those of the scans at twice their distance. The axis
+    is Y of every frame: the frame of the scans is turned about Y, those of the others not at all.
     """
     small = {"scan_length": 28e-3, "line_pitch": 140e-6, "layout": {"points": 800, "width": 20e-3}}
     scan = {"positions": POSITIONS, "warm_up": (7200.0,)}
     pose = {"procedure": "profiler_pose", "profiler_pose": {"dz": NOMINAL_LIFT}}
+    registered = {"positions": POSITIONS, "warm_up": (1800.0, 7200.0), "profiler_pose": {"dz": NOMINAL_LIFT}}
     coarse = {"line_pitch": 140e-6, "layout": {"points": 800, "width": 40e-3}}
     return (
         MethodSubject(
@@ -45,5 +47,15 @@ def subjects() -> tuple[MethodSubject, ...]:
             measured=("height",),
             motion=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
             seeds=40,
+        ),
+        MethodSubject(
+            CrossbeamScan,
+            partial(ModelMethod.simulate, CrossbeamScan(), Settings.model_validate(registered)),
+            name="registrations",
+            settings=registered,
+            raw_vectors={"profiler_pose": "pose", "lever": "direction"},
+            optional=("lever_uncertainty", "pose_covariance", "strain_effect"),
+            measured=("displacement", "rotation"),
+            motion=((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),  # the covariance of the pose is that of angles about axes
         ),
     )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
-from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping
@@ -14,20 +15,23 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
+    from errormotion.measurement import Observed
+    from errormotion.plugins import Redrawing
 
 
-class CrossbeamScan(Method):
+class CrossbeamScan(ModelMethod):
     """Thermal errors of the carriage on a crossbeam, from repeated scans of artefacts below it."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="crossbeam_scan",
         summary="Six thermal errors of a crossbeam's axis from repeated scans of artefacts with a line profiler",
         status="simulated_only",
-        version="3",
+        version="4",
         cannot_see=(
             "errors of the cold machine: all errors are relative to the cold scans",
             "motion of the table and its artefacts together with the crossbeam",
             "errors between two artefacts that affect neither of them",
+            "expansion of ram and spindle between carriage and tool, and of the table: they are a part of the errors",
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
@@ -39,7 +43,6 @@ class CrossbeamScan(Method):
     simulate = lazy("errormotion.methods.crossbeam_scan.simulation:simulate")
     truth = lazy("errormotion.methods.crossbeam_scan.simulation:truth_of")
     conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
-    redrawing = lazy("errormotion.methods.crossbeam_scan.redrawing:redrawing")
 
     def acquire(
         self, bench: Bench, settings: ScanSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
@@ -130,11 +133,32 @@ class CrossbeamScan(Method):
 
         return steps(settings)
 
+    def observe(self, raw: xr.Dataset, settings: ScanSettings) -> Observed:
+        """Return the registrations of scans as a problem of least squares; see ``identification.model``."""
+        from errormotion.methods.crossbeam_scan.identification.scans import observe
+
+        return observe(raw, settings)[0]
+
+    def expected(self, settings: ScanSettings) -> xr.Dataset:
+        """Return the registrations of a campaign, without noise; see ``planning``."""
+        from errormotion.methods.crossbeam_scan.planning import expected
+
+        if settings.procedure == "profiler_pose":
+            raise NotImplementedError("edges of a pocket scatter as the sensor sees them: nothing is expected of scans")
+        return expected(settings)
+
     def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance. See ``planning``."""
-        from errormotion.methods.crossbeam_scan.planning import plan
+        from errormotion.methods.crossbeam_scan.planning import plan_pose
 
-        return plan(self.info, settings or ScanSettings())
+        settings = settings or ScanSettings()
+        return plan_pose(self.info, settings) if settings.procedure == "profiler_pose" else super().plan(settings)
+
+    def redrawing(self, raw: xr.Dataset, settings: ScanSettings, errors: xr.Dataset) -> Redrawing:
+        """Return the sources of scans, or those of a pocket, for the Monte Carlo evaluation."""
+        from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import redrawing
+
+        return redrawing(raw, settings) if "pocket_radius" in raw else super().redrawing(raw, settings, errors)
 
     def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
         """Return the error dataset of a raw dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
@@ -162,4 +186,4 @@ class CrossbeamScan(Method):
             return identify_pose(checked, settings, self.info.id, self.info.version)
         from errormotion.methods.crossbeam_scan.identification.scans import identify_scans
 
-        return identify_scans(checked, settings, self.info.id, self.info.version)
+        return identify_scans(self, checked, settings)

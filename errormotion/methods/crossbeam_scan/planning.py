@@ -1,4 +1,4 @@
-"""Expected covariance of the errors of a campaign.
+"""What a campaign is expected to give: registrations with their covariance, and the covariance of the profiler's pose.
 
 The artefacts are waves along x and y. Their slopes determine the information of one registration, line by line. A line
 that jitters along z and y with the variances t (of both scans) has two additional unknowns, with the columns B and the
@@ -16,13 +16,12 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import MethodError
-from errormotion.kinematics.twists import transform_covariance
-from errormotion.methods.crossbeam_scan.identification import strain
-from errormotion.methods.crossbeam_scan.identification.carriage import Rig
-from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, carriage_errors, pose_twists
+from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, from_maps, pose_twists
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
 from errormotion.methods.crossbeam_scan.identification.registration.extra import BASES
+from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, estimated
+from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:
@@ -38,13 +37,8 @@ _CELLS = 100  # of a profile
 _SINGULAR = 1e12  # condition number
 
 
-def plan(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return an error dataset of zeros with the expected covariance, for the procedure of the settings."""
-    return _plan_pose(info, settings) if settings.procedure == "profiler_pose" else _plan_scans(info, settings)
-
-
-def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
-    """Return the plan of scans, over (time, position).
+def expected(settings: Settings) -> xr.Dataset:
+    """Return the registrations of scans without noise, for a carriage on its guide with errors of typical size.
 
     Raises
     ------
@@ -53,48 +47,47 @@ def _plan_scans(info: MethodInfo, settings: Settings) -> xr.Dataset:
     """
     if not settings.positions:
         raise MethodError("A plan needs the positions of the artefacts: set positions, such as ['350 mm', '550 mm']")
-    positions = np.array(settings.positions)
-    pose = settings.profiler_pose or PoseSettings()
-    lever, lever_uncertainty = np.array(settings.lever), np.array(settings.lever_uncertainty)
-    rig = Rig(stated_pose(pose), lever, stated_covariance(pose), lever_uncertainty)
-    W, A = strain.from_maps(rig.pose)[:6], carriage_adjoint(rig.pose, rig.lever)
-    noise = np.tile(W @ registration_covariance(settings) @ W.T, (positions.size, 1, 1))
-    if settings.strain == "guided":
-        twist = np.zeros((positions.size, 6))
-        noise = strain.guided(twist, noise, positions, A, settings.guide_uncertainty).covariance
-    own = transform_covariance(noise, A)
-    shared = carriage_errors(
-        EXPECTED_ERRORS, np.zeros((6, 6)), rig.pose, rig.lever,
-        pose_covariance=rig.pose_covariance, lever_uncertainty=rig.lever_uncertainty,
-    )  # fmt: skip
-    time = np.array([0.0, *settings.warm_up])
-    shape = (time.size, positions.size)
-    covariance = np.broadcast_to(own, (*shape, 6, 6)).copy()
-    # The influence at the carriage's origin is stated for the expected size of the errors, which are not known yet.
-    influence = np.broadcast_to(shared.influence[:, None, None], (len(shared.sources), *shape, 6)).copy()
-    covariance += np.einsum("stki,stkj->tkij", influence, influence)
-    covariance[0], influence[:, 0] = 0.0, 0.0
-    return build_errors(
-        np.zeros((*shape, 6)),
-        covariance,
-        dims=("time", "position"),
-        coords={"time": time, "y": ("position", positions, {"units": "m"})},
-        component="Y",
-        machine="plan",
-        frame="carriage, machine directions",
-        functional_point=np.zeros(3),
-        reference="planned, not measured",
-        method=info.id,
-        method_version=info.version,
-        provenance=provenance.make(settings, None, None, steps=["plan"]),
-        influence=influence,
-        sources=shared.sources,
-        source_groups=shared.source_groups,
+    positions, time = np.array(settings.positions), np.array([0.0, *settings.warm_up])
+    stated = settings.profiler_pose or PoseSettings()
+    pose, lever = stated_pose(stated), np.array(settings.lever)
+    E = np.tile(EXPECTED_ERRORS, (positions.size, 1))
+    along = positions - positions.mean()
+    E[:, 2] += E[:, 3] * along  # EA = dEZ/dY, EC = -dEX/dY
+    E[:, 0] -= E[:, 5] * along
+    of_profiler = E @ np.linalg.inv(carriage_adjoint(pose, lever)).T
+    shape = time.size, positions.size
+    registration = np.zeros((*shape, 6))
+    registration[1:] = of_profiler @ np.linalg.inv(from_maps(pose)[:6, :6]).T
+    C, effect = registration_covariance(settings)
+    known = (np.arange(time.size) > 0)[:, None, None, None]
+    scan = ("cycle", "artefact", "direction")
+    return xr.Dataset(
+        {
+            "displacement": (scan, registration[..., :3], {"units": "m"}),
+            "rotation": (scan, registration[..., 3:], {"units": "rad"}),
+            "registration_covariance": (
+                (*scan[:2], "registered", "registered_"),
+                known * np.tile(C[:6, :6], (*shape, 1, 1)),
+            ),
+            "strain_effect": ((*scan[:2], "registered", "strain"), np.tile(effect[:6], (*shape, 1, 1))),
+            "cold_share": (scan[:2], np.full(shape, 0.5)),
+            "time": ("cycle", time, {"units": "s"}),
+            "position": ("artefact", positions, {"units": "m"}),
+            "profiler_pose": (("row", "column"), pose.as_matrix()),
+            "pose_covariance": (("p", "p_"), stated_covariance(stated)),
+            "lever": ("direction", lever, {"units": "m"}),
+            "lever_uncertainty": ("direction", np.array(settings.lever_uncertainty), {"units": "m"}),
+        },
+        {"direction": list("xyz")},
+        {"schema": SCHEMA, "machine": "plan"},
     )
 
 
-def registration_covariance(settings: Settings) -> Array:
-    """Return the expected covariance (9, 9) of (T_Q, R_Q, drift) of one registration; a rigid scan has no drift."""
+def registration_covariance(settings: Settings) -> tuple[Array, Array]:
+    """Return the expected covariance (9, 9) of (T_Q, R_Q, drift) by noise, and their errors (9, 3) by the strains.
+
+    A rigid scan has no drift. What strains are is stated with `Registrations`.
+    """
     layout = settings.layout
     x = (np.arange(_CELLS) + 0.5) / _CELLS * layout.width - layout.width / 2
     lines = max(2, round(settings.scan_length / settings.line_pitch))
@@ -108,7 +101,7 @@ def registration_covariance(settings: Settings) -> Array:
     Q = np.stack([X, Y, z], axis=-1)
     J = np.concatenate([n, np.cross(Q, n), n * Q[..., 1:2]], axis=-1)
     used = 6 if settings.strain == "rigid" else 9
-    strains = settings.strains()
+    strains = estimated(settings)
     stretched = [np.einsum("lpi,ij,lpj->lp", n, BASES[name], Q) for name in strains]
     J = np.stack([*np.moveaxis(J[..., :used], -1, 0), *stretched], axis=-1)
     own = np.stack([np.ones_like(z), zy], axis=-1)
@@ -120,13 +113,17 @@ def registration_covariance(settings: Settings) -> Array:
     priors = range(used, J.shape[-1])
     information[priors, priors] += np.array([value**-2 for value in strains.values()])
     scale = 1 / np.sqrt(np.diag(information))
-    out = np.zeros((9, 9))
     joint = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+    out, effect = np.zeros((9, 9)), np.zeros((9, 3))
     out[:used, :used] = joint[:used, :used]
-    return out
+    for k, (name, sigma) in enumerate(strains.items()):
+        of = -joint[:used, used + k] / sigma**2
+        out[:used, :used] -= sigma**2 * np.outer(of, of)
+        effect[:used, STRAINS.index(name)] = of
+    return out, effect
 
 
-def _plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
+def plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     """Return the plan of scans of a pocket: edges of the rim, and the plate next to it.
 
     Raises

@@ -1,10 +1,11 @@
-"""Raw schema of the method: scans, scans as recorded, and the scans of a pocket."""
+"""Raw schema of the method: scans, scans as recorded, registrations of scans, and the scans of a pocket."""
 
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, NOISE, POSITION, RADIUS, XYZ, RawSchema, Row
 
 SCHEMA = "errormotion.raw.crossbeam_scan/1"
-_PROFILER = (
-    Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame"),
+_X = Row("x", ("point",), "m", -1.0, 1.0, "along the profile, profiler frame")
+_HEIGHT_NOISE = Row("height_noise", (), "m", *NOISE, "standard deviation of one height")
+_RIG = (
     Row("position", ("artefact",), "m", *POSITION, "position of the axis at each artefact"),
     Row("profiler_pose", ("row", "column"), "", *POSITION, "homogeneous matrix, profiler to tool frame; m, 1"),
     Row(
@@ -18,16 +19,15 @@ _PROFILER = (
     ),
     Row("lever", ("direction",), "m", *POSITION, "(x_y, 0, z_y): carriage to tool frame"),
     Row("lever_uncertainty", ("direction",), "m", 0.0, 1.0, "standard uncertainty of `lever`", required=False),
-    Row("height_noise", (), "m", *NOISE, "standard deviation of one height"),
-    Row(
-        "warm_up",
-        ("cycle",),
-        "s",
-        0.0,
-        NO_LIMIT,
-        "warm-up time before each cycle; 0 = cold: cycle 0 is the reference, others repeat it",
-        required=False,
-    ),
+)
+_WARM_UP = Row(
+    "warm_up",
+    ("cycle",),
+    "s",
+    0.0,
+    NO_LIMIT,
+    "warm-up time before each cycle; 0 = cold: cycle 0 is the reference, others repeat it",
+    required=False,
 )
 _PROFILER_SIZES = {"row": 4, "column": 4, "p": 6, "p_": 6}
 
@@ -55,7 +55,10 @@ RAW_SCHEMAS = (
                 missing=True,
             ),
             Row("time", ("cycle",), "s", -NO_LIMIT, NO_LIMIT, "time of the scan; cycle 0 is the cold one"),
-            *_PROFILER,
+            _X,
+            *_RIG,
+            _HEIGHT_NOISE,
+            _WARM_UP,
         ),
         sizes={**DIRECTION, **_PROFILER_SIZES},
         labels=XYZ,
@@ -97,9 +100,60 @@ RAW_SCHEMAS = (
             Row("encoder_pitch", (), "m", -1e-2, 1e-2, "travel of the axis per count"),
             Row("encoder_zero", (), "m", *POSITION, "position of the axis where the count is 0"),
             Row("scan_length", (), "m", 0.0, 1.0, "length of a scan along the feed"),
-            *_PROFILER,
+            _X,
+            *_RIG,
+            _HEIGHT_NOISE,
+            _WARM_UP,
         ),
         sizes={**DIRECTION, **_PROFILER_SIZES},
+        labels=XYZ,
+    ),
+    RawSchema(
+        SCHEMA,
+        "registrations",
+        "registered",
+        (
+            Row(
+                "displacement",
+                ("cycle", "artefact", "direction"),
+                "m",
+                -1.0,
+                1.0,
+                "of the profiler from the cold scan to this one, in its frame; 0 in the cold cycle; NaN = none",
+                missing=True,
+            ),
+            Row("rotation", ("cycle", "artefact", "direction"), "rad", -1.0, 1.0, "of the profiler", missing=True),
+            Row(
+                "registration_covariance",
+                ("cycle", "artefact", "registered", "registered_"),
+                "",
+                -1.0,
+                1.0,
+                "covariance of displacement and rotation by the noise of both scans; m, rad",
+                missing=True,
+            ),
+            Row(
+                "strain_effect",
+                ("cycle", "artefact", "registered", "strain"),
+                "",
+                -NO_LIMIT,
+                NO_LIMIT,
+                "their errors by scales of the profiler along x and z and by an expansion of the artefact of 1 m/m",
+                required=False,
+            ),
+            Row(
+                "cold_share",
+                ("cycle", "artefact"),
+                "",
+                0.0,
+                1.0,
+                "share of the covariance by the noise of the cold scan",
+            ),
+            Row("time", ("cycle",), "s", -NO_LIMIT, NO_LIMIT, "time of the scan; cycle 0 is the cold one"),
+            *_RIG,
+            _WARM_UP,
+        ),
+        sizes={**DIRECTION, **_PROFILER_SIZES, "registered": 6, "registered_": 6, "strain": 3},
         labels=XYZ,
     ),
     RawSchema(

@@ -12,8 +12,10 @@ from errormotion.plugins import PluginSettings
 
 MINUTE = 60.0
 STRAIN = 20e-6
-"""Standard uncertainty of a scale or expansion that is not stated, m/m: of a steel artefact, 2 K; of a profiler, a
-fifth of 0.01 % per kelvin, as data sheets state, at 1 K."""
+"""Standard uncertainty of a scale or expansion that is not stated, m/m: of steel, 2 K; of a profiler, a fifth of 0.01 %
+per kelvin, as data sheets state, at 1 K."""
+HEIGHT = 0.05
+"""Height of the artefacts where none is stated, m."""
 
 
 class PoseSettings(PluginSettings):
@@ -131,6 +133,18 @@ class Settings(PluginSettings):
         description="relative standard uncertainty of the artefacts' expansion between cold and warm; default: "
         "20 um/m, with a note",
     )
+    artefact_height: Length | None = Field(
+        default=None,
+        ge=0,
+        description="height of the scanned surfaces above the plane on which the artefacts stand, which an expansion "
+        "raises; default: 50 mm, with a note",
+    )
+    mount_expansion_uncertainty: float | None = Field(
+        default=None,
+        ge=0,
+        description="relative standard uncertainty of the expansion of the profiler's mount, from the tool frame to "
+        "the profiler, between cold and warm; default: 20 um/m, with a note",
+    )
     moved: Literal["exclude", "keep"] = Field(
         default="exclude", description="treatment of the errors of an artefact that has moved"
     )
@@ -143,12 +157,16 @@ class Settings(PluginSettings):
     layout: Layout = Field(default_factory=Layout, description="artefacts and profiler that a plan assumes")
 
     def strains(self) -> dict[str, float]:
-        """Return the standard uncertainty, m/m, of each scale and expansion that is not exact, by its parameter."""
-        scale, expansion = (
-            STRAIN if value is None else value for value in (self.scale_uncertainty, self.expansion_uncertainty)
+        """Return the standard uncertainty, m/m, of each scale and expansion: of the profiler, artefacts, and mount."""
+        scale, expansion, mount = (
+            STRAIN if value is None else value
+            for value in (self.scale_uncertainty, self.expansion_uncertainty, self.mount_expansion_uncertainty)
         )
-        known = {"scale_x": scale, "scale_z": scale, "expansion": expansion}
-        return {name: value for name, value in known.items() if value > 0}
+        return {"scale_x": scale, "scale_z": scale, "expansion": expansion, "mount": mount}
+
+    def height_of_artefacts(self) -> float:
+        """Return the height of the artefacts, m."""
+        return HEIGHT if self.artefact_height is None else self.artefact_height
 
     @model_validator(mode="after")
     def _fits(self) -> Settings:

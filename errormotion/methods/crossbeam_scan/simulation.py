@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 POSITIONS = (-0.5, 0.0, 0.5)
 """Positions of the axis over the artefacts where the settings state none, m."""
 _SCAN, _PHASE = 1, 2
-_LEVER = 2
+_LEVER, _STRAIN = 2, 3
 
 
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return the raw dataset of a campaign or of a pocket with these settings, and the true errors.
 
     The size of a scan follows from ``scan_length``, ``line_pitch`` and ``layout``. There is one cold pass. The stated
-    lever has an error drawn from ``lever_uncertainty``.
+    lever has an error drawn from ``lever_uncertainty``; scales and expansions are drawn from the settings.
 
     Raises
     ------
@@ -57,10 +57,31 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     times, positions = (0.0, *settings.warm_up), settings.positions or POSITIONS
     profiles = round(settings.scan_length / feed)
     raw = raw_scans(machine, times, positions, seed=seed, profiler=profiler, profiles=profiles, feed=feed)
+    raw = strained(raw, settings, np.random.default_rng([seed, _STRAIN]))
     raw["lever"] = raw["lever"] + np.random.default_rng([seed, _LEVER]).normal(0, settings.lever_uncertainty)
     raw["lever"].attrs["units"] = "m"
     raw["lever_uncertainty"] = ("direction", np.array(settings.lever_uncertainty), {"units": "m"})
     return raw, truth_axis(machine, times, positions)
+
+
+def strained(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> xr.Dataset:
+    """Return scans with scales of the profiler, and expansions of its mount and of artefacts, as settings state them.
+
+    Scales and mount are one draw for each warm cycle, the expansion one for each scan. An artefact expands about the
+    middle of its foot: a surface with the heights z(x, y) that is (1 + e) times as large has (1 + e) z - e (x dz/dx +
+    y dz/dy), and stands higher by e times its height.
+    """
+    u = settings.strains()
+    height = raw["height"].values.copy()
+    x, up = raw["x"].values, np.linalg.inv(raw["profiler_pose"].values)[2, 3]  # of the tool frame over the profiler
+    for cycle in range(1, len(height)):
+        along, across, mount = generator.normal(size=3) * [u["scale_x"], u["scale_z"], u["mount"]]
+        for k, z in enumerate(height[cycle]):
+            y, e = raw["y"].values[cycle, k], generator.normal() * u["expansion"]
+            picture = (across + e) * z - (along + e) * x * np.gradient(z, x, axis=1)
+            picture -= e * y[:, None] * np.gradient(z, y, axis=0)
+            z += np.nan_to_num(picture).astype(np.float32) + np.float32(e * settings.height_of_artefacts() + mount * up)
+    return raw.assign(height=(raw["height"].dims, height, raw["height"].attrs))
 
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:  # noqa: ARG001 - the interface

@@ -358,7 +358,13 @@ def plan(subject: MethodSubject) -> str:
 
 def why_nothing_expected(subject: MethodSubject) -> str:
     """Return why a plan cannot be compared with the identification of what it expects; empty if it can."""
-    return "" if states(subject.plugin, "expected") else "the method has no expected raw data (expected)"
+    if not states(subject.plugin, "expected"):
+        return "the method has no expected raw data (expected)"
+    try:
+        subject.plugin().expected(subject.effective_settings())
+    except NotImplementedError as error:  # of one of several procedures
+        return str(error)
+    return ""
 
 
 @METHOD_CHECKS.add(why_not=why_nothing_expected)

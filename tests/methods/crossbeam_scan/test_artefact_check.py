@@ -10,10 +10,9 @@ from scipy.spatial.transform import RigidTransform
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification import chain
-from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, check_artefacts
-from errormotion.methods.crossbeam_scan.identification.carriage import Carriage
+from errormotion.methods.crossbeam_scan.identification.artefacts import MOVED, check_artefacts
+from errormotion.methods.crossbeam_scan.identification.model import Campaign
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
-from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
@@ -61,7 +60,7 @@ def replaced(raw, machine, cycles, artefact, step):
     return out
 
 
-EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0}
+EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansion_uncertainty": 0.0}
 """The twin's artefacts do not expand, and its profiler keeps its scale."""
 
 
@@ -170,20 +169,28 @@ def judged(seed, step=None):
     """Return the check of simulated registrations with the planned noise, one artefact moved by a twist."""
     crossbeam, rng = VirtualMachine("gantry", seed=seed).crossbeam, np.random.default_rng(seed)
     pose = RigidTransform.from_matrix(crossbeam.pose)
-    W, A = from_maps(pose)[:6], chain.carriage_adjoint(pose, crossbeam.lever)
-    C = W @ registration_covariance(Settings()) @ W.T
+    W, A = chain.from_maps(pose)[:6, :6], chain.carriage_adjoint(pose, crossbeam.lever)
+    C, effect = registration_covariance(Settings())
+    strains = 20e-6 * np.ones(4)
     shape = len(TIMES), len(PLACES)
-    cold, own = rng.multivariate_normal(np.zeros(6), C / 2, (2, *shape))
-    twist = crossbeam.twist(TIMES[:, None], PLACES) @ np.linalg.inv(A).T + cold[:1] + own
-    twist[0] = 0.0
+    cold, own = rng.multivariate_normal(np.zeros(9), C / 2, (2, *shape))
+    stretched = rng.normal(0, 20e-6, (*shape, 3)) @ effect.T
+    twist = crossbeam.twist(TIMES[:, None], PLACES) @ np.linalg.inv(A).T
     if step is not None:
         twist[4:, 3] += step
-    known = np.broadcast_to(np.where(np.arange(len(TIMES))[:, None, None, None] == 0, 0.0, C), (*shape, 6, 6))
-    axis = Carriage(**dict.fromkeys((f.name for f in dataclasses.fields(Carriage)), None))
-    axis = dataclasses.replace(axis, profiler=twist, profiler_covariance=known)
-    found = Registrations(**dict.fromkeys((f.name for f in dataclasses.fields(Registrations)), None))
-    found.reason, found.cold_share = np.full(shape, "", dtype=object), np.full(shape, 0.5)
-    return check_artefacts(axis, found, Settings(), PLACES, TIMES[2:], [0, 1], [2, 3, 4, 5])
+    registered = cold[:1] + own + stretched
+    registered[..., :6] += twist @ np.linalg.inv(W).T
+    registered[0] = 0.0
+    warm = (np.arange(len(TIMES)) > 0)[:, None]
+    found = dataclasses.replace(
+        Registrations.empty(*shape, cold=0),
+        twist=registered,
+        covariance=np.tile(C, (*shape, 1, 1)) * warm[..., None, None],
+        effect=np.tile(effect, (*shape, 1, 1)),
+        cold_share=np.broadcast_to(0.5 * warm, shape),
+    )
+    every = Campaign(found, PLACES, chain.Rig(pose, crossbeam.lever), None, strains, 0.0)
+    return check_artefacts(every, Settings(), TIMES[2:], [0, 1], [2, 3, 4, 5])
 
 
 def test_campaigns_without_motion_report_no_artefact():

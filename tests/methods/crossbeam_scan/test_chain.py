@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.datasets import build_errors, provenance, validate
 from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displaced, displacement, log
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.chain import Rig
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
@@ -32,6 +32,11 @@ def H(gantry):
 def lever(gantry):
     """From the carriage to the tool frame."""
     return gantry.crossbeam.lever
+
+
+def errors_of(motion, rig):
+    """Return the errors of the carriage from motions of the profiler."""
+    return chain.carriage_errors(motion, np.zeros((*np.shape(motion), 6)), rig)[0]
 
 
 def motions(errors, H, lever):
@@ -75,11 +80,11 @@ def registered(gantry, raw, cycle, by_line=False, assumed=None):
 
 def test_errors_of_the_carriage_follow_from_the_motion_of_the_profiler(gantry, H, lever):
     truth = simulation.truth_axis(gantry, [0, 600, T], [-0.5, Y]).em.twist().values
-    found = chain.carriage_errors(motions(truth, H, lever), np.zeros((3, 2, 6, 6)), H, lever)
+    found = errors_of(motions(truth, H, lever), Rig(H, lever))
     # second order: 2.2 m times (30 urad)^2
-    assert found.values[..., :3] == pytest.approx(truth[..., :3], abs=2e-9)
-    assert found.values[..., 3:] == pytest.approx(truth[..., 3:], abs=1e-9)
-    assert not found.values[0].any()
+    assert found[..., :3] == pytest.approx(truth[..., :3], abs=2e-9)
+    assert found[..., 3:] == pytest.approx(truth[..., 3:], abs=1e-9)
+    assert not found[0].any()
 
 
 def test_sign_and_direction_are_those_of_the_scans(gantry, H, lever):
@@ -87,17 +92,17 @@ def test_sign_and_direction_are_those_of_the_scans(gantry, H, lever):
     raw = simulation.raw_scans(gantry, [0, T], [Y], **scans)
     truth = simulation.truth_axis(gantry, [T], [Y]).em.twist().values[0, 0]
     assert np.abs(registered(gantry, raw, 0)).max() < 1e-9
-    found = chain.carriage_errors(registered(gantry, raw, 1), np.zeros((6, 6)), H, lever)
+    found = errors_of(registered(gantry, raw, 1), Rig(H, lever))
     # float32 and second order
-    assert found.values == pytest.approx(truth, abs=2e-9)
+    assert found == pytest.approx(truth, abs=2e-9)
 
 
 def missed(machine, by_line):
     """Return what the chain misses of the true motion (6,), m and rad."""
     H, lever = RigidTransform.from_matrix(machine.crossbeam.pose), machine.crossbeam.lever
     raw = simulation.raw_scans(machine, [0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT)
-    found = chain.carriage_errors(registered(machine, raw, 1, by_line), np.zeros((6, 6)), H, lever)
-    return found.values - simulation.truth_axis(machine, [T], [Y]).em.twist().values[0, 0]
+    found = errors_of(registered(machine, raw, 1, by_line), Rig(H, lever))
+    return found - simulation.truth_axis(machine, [T], [Y]).em.twist().values[0, 0]
 
 
 def test_rigid_registration_takes_strain_for_yaw(gantry):
@@ -137,7 +142,7 @@ def test_effect_of_a_wrong_pose_equals_a_new_evaluation(H, lever):
     M = motions(errors, H, lever)
     for change in rng.normal(0, [0.01] * 3 + [1e-3] * 3, (5, 6)):
         wrong = calibration.pose(*(calibration.parameters(H) + change))
-        again, right = (chain.carriage_errors(M, np.zeros((50, 6, 6)), pose, lever).values for pose in (wrong, H))
+        again, right = (errors_of(M, Rig(pose, lever)) for pose in (wrong, H))
         effect = calibration_effect(right, H, lever, change)
         # next order: the change, 0.01 rad, once more
         assert np.abs(again - right - effect).max(axis=0) / np.abs(effect).max(axis=0) == pytest.approx(0, abs=0.05)
@@ -147,11 +152,11 @@ def test_effect_of_a_wrong_pose_equals_a_new_evaluation(H, lever):
 def test_assembly_with_a_wrong_pose_has_no_larger_effect_than_the_chain(gantry, H, lever, by_line):
     # 10 mrad against errors of 33 um and 10 urad: products of the two, some of them on the lever of 2.2 m
     raw = simulation.raw_scans(gantry, [0, T], [Y], seed=1, profiles=40, feed=1e-3, profiler=PERFECT, motion="rigid")
-    right = chain.carriage_errors(registered(gantry, raw, 1, by_line), np.zeros((6, 6)), H, lever).values
+    right = errors_of(registered(gantry, raw, 1, by_line), Rig(H, lever))
     for change in 0.01 * np.eye(3, 6):
         wrong = calibration.pose(*(calibration.parameters(H) + change))
         motion = registered(gantry, raw, 1, by_line, wrong)
-        again = chain.carriage_errors(motion, np.zeros((6, 6)), wrong, lever).values
+        again = errors_of(motion, Rig(wrong, lever))
         assert np.abs(again - right)[:3].max() < 0.01 * 33e-6
         assert np.abs(again - right)[3:].max() < 0.01 * 12e-6
 
@@ -167,23 +172,17 @@ def test_effect_of_a_wrong_pose_has_the_published_size(H):
     assert 0.05e-6 < effect[:, :3].mean() < 0.3e-6
 
 
-def test_influence_is_the_effect_of_one_standard_uncertainty(H, lever):
+def test_pose_and_lever_are_in_the_covariance(H, lever):
     errors = np.array([3e-6, 40e-6, -8e-6, -20e-6, 15e-6, 5e-6])
     M = motions(errors, H, lever)
     size = [1e-3, 2e-3, 3e-3, 1e-5, 2e-5, 3e-5]
-    found = chain.carriage_errors(M, np.zeros((6, 6)), H, lever, pose_covariance=np.diag(size) ** 2)
-    one_by_one = [calibration_effect(found.values, H, lever, step) for step in np.diag(size)]
-    assert found.covariance == pytest.approx(np.einsum("si,sj", one_by_one, one_by_one), rel=1e-9, abs=1e-24)
-    assert np.einsum("si,sj", found.influence, found.influence) == pytest.approx(found.covariance)
-
-
-def test_lever_is_a_separate_source(H, lever):
-    errors = np.array([0, 0, 0, 20e-6, 10e-6, -5e-6])
-    M = motions(errors, H, lever)
-    found = chain.carriage_errors(M, np.zeros((6, 6)), H, lever, lever_uncertainty=(2e-3, 0, 2e-3))
-    again = chain.carriage_errors(M, np.zeros((6, 6)), H, lever + np.array([2e-3, 0, 0])).values - found.values
-    assert found.influence[found.sources.index("lever x")] == pytest.approx(again, abs=1e-13)
-    assert not found.influence[found.sources.index("lever y")].any()
+    found, C = chain.carriage_errors(M, np.zeros((6, 6)), Rig(H, lever, np.diag(size) ** 2))
+    one_by_one = [calibration_effect(found, H, lever, step) for step in np.diag(size)]
+    assert pytest.approx(np.einsum("si,sj", one_by_one, one_by_one), rel=1e-9, abs=1e-24) == C
+    u = np.array([2e-3, 0, 1e-3])
+    _, C = chain.carriage_errors(M, np.zeros((6, 6)), Rig(H, lever, lever_uncertainty=u))
+    one_by_one = [errors_of(M, Rig(H, lever + step)) - found for step in np.diag(u)]
+    assert pytest.approx(np.einsum("si,sj", one_by_one, one_by_one), rel=1e-9, abs=1e-24) == C
 
 
 def test_truth_lies_within_the_stated_covariance(gantry, H, lever):
@@ -196,55 +195,51 @@ def test_truth_lies_within_the_stated_covariance(gantry, H, lever):
     for _ in range(300):
         pose = calibration.pose(*(calibration.parameters(H) + rng.multivariate_normal(np.zeros(6), COVARIANCE)))
         seen = M + rng.normal(size=(2, 6)) @ root.T
-        found = chain.carriage_errors(seen, C, pose, lever, pose_covariance=COVARIANCE)
-        miss = found.values - truth
-        squares.append(np.mean([m @ np.linalg.solve(c, m) for m, c in zip(miss, found.covariance, strict=True)]))
+        found, total = chain.carriage_errors(seen, C, Rig(pose, lever, COVARIANCE))
+        squares.append(np.mean([m @ np.linalg.solve(c, m) for m, c in zip(found - truth, total, strict=True)]))
     # 300 draws of 12 numbers: 6 +/- 0.14
     assert np.mean(squares) == pytest.approx(6, abs=0.5)
-
-
-def test_results_make_a_valid_error_dataset_with_a_gap(gantry, H, lever):
-    truth = simulation.truth_axis(gantry, [0, T], [-0.5, Y]).em.twist().values
-    M = motions(truth, H, lever)
-    M[1, 0] = np.nan
-    C = np.tile(np.diag([50e-9] * 3 + [0.5e-6] * 3) ** 2, (2, 2, 1, 1))
-    found = chain.carriage_errors(M, C, H, lever, pose_covariance=COVARIANCE, lever_uncertainty=(1e-3, 0, 1e-3))
-    assert np.isnan(found.values[1, 0]).all()
-    assert np.isfinite(np.delete(found.values.reshape(4, 6), 2, axis=0)).all()
-    ds = build_errors(
-        found.values,
-        found.covariance,
-        dims=("time", "position"),
-        coords={"time": [0.0, T], "y": ("position", [-0.5, Y], {"units": "m"})},
-        component="Y",
-        machine="Gantry 4000",
-        frame="carriage",
-        functional_point=np.zeros(3),
-        reference="cold scan",
-        method="crossbeam_scan",
-        method_version="1",
-        provenance=provenance.make({}, None, None),
-        influence=found.influence,
-        sources=found.sources,
-        source_groups=found.source_groups,
-    )
-    validate(ds)
 
 
 def test_feed_is_along_the_machine(H):
     assert H.rotation.apply(chain.feed_direction(H)) == pytest.approx([0, 1, 0], abs=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"motion": np.zeros(5)}, r"motions \(\.\.\., 6\)"),
-        ({"covariance": np.zeros((2, 6, 6))}, "found"),
-        ({"pose_covariance": np.zeros((3, 3))}, "symmetric"),
-        ({"pose_covariance": -np.eye(6)}, "symmetric"),
-    ],
-)
-def test_wrong_shapes_are_refused(H, lever, changes, message):
-    given = {"motion": np.zeros(6), "covariance": np.zeros((6, 6)), "profiler_pose": H, "lever": lever} | changes
-    with pytest.raises(MethodError, match=message):
-        chain.carriage_errors(**given)
+@pytest.mark.parametrize("covariance", [np.zeros((3, 3)), -np.eye(6)])
+def test_a_covariance_of_the_pose_that_is_none_is_refused(covariance):
+    with pytest.raises(MethodError, match="symmetric"):
+        chain.root(covariance)
+
+
+def displacement_of_map(H, twist, g, Q):
+    """Return how a point Q of the map moves, by the geometry of the lines: from the definition."""
+    f = chain.feed_direction(H)
+    x, s, z = Q
+
+    def seen(point, along):  # the map's coordinates of a point of the profiler's frame
+        way = along + point[1] / f[1]
+        return np.array([point[0] - point[1] / f[1] * f[0], way, point[2] - point[1] / f[1] * f[2]])
+
+    moved = np.array([x, 0, z]) + twist[:3] + np.cross(twist[3:], [x, 0, z]) + s * g
+    return seen(moved, s) - Q
+
+
+def test_maps_move_according_to_the_matrix():
+    H = calibration.pose(0.02, -0.015, 0.03, 0.0, 0.0, 0.0)
+    rng = np.random.default_rng(1)
+    W = chain.from_maps(H)
+    for o in rng.normal(0, 1e-5, (5, 9)):
+        TQ, RQ, c = np.split(np.linalg.solve(W, o), 3)
+        for Q in rng.uniform(-0.03, 0.03, (5, 3)) * [1, 1, 0.05]:
+            there = displacement_of_map(H, o[:6], o[6:], Q)
+            stated = TQ + np.cross(RQ, Q) + Q[1] * c
+            # what no rotation describes: 0.03 rad of 1e-5 rad over 20 mm in x, of which nothing is left in z
+            assert there == pytest.approx(stated, abs=0.04 * 3e-5 * 0.03)
+            assert there[2] == pytest.approx(stated[2], abs=0.04 * 3e-5 * 1.5e-3 + 1e-13)
+
+
+def test_a_square_profiler_changes_nothing_but_the_drift():
+    W = chain.from_maps(RigidTransform.identity())
+    assert W[:6] == pytest.approx(np.eye(6, 9))
+    # a rigid picture: no displacement beside the rotation, so that g is what the rotation does along the feed
+    assert (W @ [0, 0, 0, 1, 2, 3, 0, 0, 0])[6:] == pytest.approx([-3, 0, 1])

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
+from errormotion.methods.crossbeam_scan.identification.artefacts import cold_repeats, moved_artefacts
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint
-from errormotion.methods.crossbeam_scan.identification.consistency import cold_repeats, moved_artefacts
 from errormotion.twin import VirtualMachine
 
 PLACES = 0.35 + 0.2 * np.arange(8)
@@ -32,8 +32,8 @@ def campaign(seed, cycles=CYCLES, places=PLACES):
     return errors, np.broadcast_to(COVARIANCE, (t, n, 6, 6)), to_carriage
 
 
-def moved(*arguments, cold_share=0.5, **options):
-    found = moved_artefacts(*arguments, cold_share=cold_share, **options)
+def moved(time, places, errors, C, cold_share=0.5, **options):
+    found = moved_artefacts(time, places, errors, C, cold_covariance=cold_share * np.asarray(C), **options)
     assert found.tested
     return [(one.artefact, one.since) for one in found.moved]
 
@@ -113,7 +113,7 @@ def test_step_is_measured_with_its_covariance():
     for seed in range(20):
         errors, C, _ = campaign(seed, cycles, places)
         errors[2:, 3] += jump
-        (found,) = moved_artefacts(cycles, places, errors, C, cold_share=0.5).moved
+        (found,) = moved_artefacts(cycles, places, errors, C, cold_covariance=0.5 * C).moved
         off = found.step - jump
         score.append(off @ np.linalg.solve(found.covariance, off))
         assert found.probability < 1e-4
@@ -175,7 +175,7 @@ def test_large_step_is_found_in_twists_at_the_carriage_too():
     assert moved(CYCLES, PLACES, errors @ to_carriage.T, to_carriage @ C @ to_carriage.T) == [(3, 4)]
 
 
-def test_cold_share_need_not_be_known():
+def test_part_of_the_cold_scan_need_not_be_known():
     errors, C, _ = campaign(seed=9)
     assert moved(CYCLES, PLACES, errors, C, cold_share=0.0) == []
     errors[4:, 3] += step(5e-6, "EZ")

@@ -1,25 +1,21 @@
 """Smooth curves over position and time: the truth lies in their bands."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.methods.crossbeam_scan.identification import chain
-from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig
+from errormotion.methods.crossbeam_scan.identification.chain import Rig
 from errormotion.methods.crossbeam_scan.identification.curves import MOMENTS, curves
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
-from errormotion.methods.crossbeam_scan.identification.strain import from_maps
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
 
 PLACES = np.linspace(-0.7, 0.7, 8)
 TIMES = 60.0 * np.array([0, 7, 15, 30, 45, 60, 90, 120, 150, 180])
-WARM = list(range(1, len(TIMES)))
+EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0}
 POSE_COVARIANCE = np.diag([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5]) ** 2
 LEVER_UNCERTAINTY = np.full(3, 1e-3)
 SHARE = 0.5
@@ -30,29 +26,24 @@ def campaign(seed, places=PLACES):
     """Return registrations of the twin with the noise that a plan expects, seen by a rig off by its uncertainty."""
     crossbeam, rng = VirtualMachine("gantry", seed=seed).crossbeam, np.random.default_rng(seed)
     pose = RigidTransform.from_matrix(crossbeam.pose)
-    W, A = from_maps(pose)[:6], chain.carriage_adjoint(pose, crossbeam.lever)
-    C = W @ registration_covariance(Settings()) @ W.T
+    W, A = chain.from_maps(pose)[:6], chain.carriage_adjoint(pose, crossbeam.lever)
+    C = W @ registration_covariance(Settings(**EXACT))[0] @ W.T
     shape = len(TIMES), len(places)
     cold, own = rng.multivariate_normal(np.zeros(6), C, (2, *shape))
     twist = crossbeam.twist(TIMES[:, None], places) @ np.linalg.inv(A).T
     twist = twist + np.sqrt(SHARE) * cold[:1] + np.sqrt(1 - SHARE) * own
     known = np.tile(C, (*shape, 1, 1))
     twist[0], known[0] = 0.0, 0.0
-    axis = Carriage(**dict.fromkeys((f.name for f in dataclasses.fields(Carriage)), None))
-    axis = dataclasses.replace(axis, profiler=twist, profiler_covariance=known)
-    found = Registrations(**dict.fromkeys((f.name for f in dataclasses.fields(Registrations)), None))
-    found.cold_share = np.full(shape, SHARE)
     p = calibration.parameters(pose) + rng.multivariate_normal(np.zeros(6), POSE_COVARIANCE)
     rig = Rig(
         calibration.pose(*p), crossbeam.lever + rng.normal(0, LEVER_UNCERTAINTY), POSE_COVARIANCE, LEVER_UNCERTAINTY
     )
-    return crossbeam, axis, found, rig
+    return crossbeam, twist, known, rig
 
 
-def drawn(axis, found, rig, places=PLACES, wrong=None):
+def drawn(twist, covariance, rig, places=PLACES):
     """Return the curves' values: name to array."""
-    wrong = np.zeros(found.cold_share.shape, dtype=bool) if wrong is None else wrong
-    extras = curves(axis, found, rig, places, TIMES[1:], WARM, wrong)
+    extras = curves(twist, covariance, SHARE * covariance, rig, places, TIMES)
     return {name: np.asarray(value[1]) for name, value in extras.items()}
 
 
@@ -89,13 +80,10 @@ def assert_about_95_percent(inside):
 
 
 def test_curves_are_more_certain_than_the_points():
-    _, axis, found, rig = campaign(0)
-    points = chain.carriage_errors(
-        axis.profiler, axis.profiler_covariance, rig.pose, rig.lever,
-        pose_covariance=rig.pose_covariance, lever_uncertainty=rig.lever_uncertainty,
-    )  # fmt: skip
-    u = np.sqrt(np.diagonal(points.covariance[-1], axis1=-2, axis2=-1))  # (artefact, dof)
-    curve = drawn(axis, found, rig)
+    _, twist, covariance, rig = campaign(0)
+    _, points = chain.carriage_errors(twist, covariance, rig)
+    u = np.sqrt(np.diagonal(points[-1], axis1=-2, axis2=-1))  # (artefact, dof)
+    curve = drawn(twist, covariance, rig)
     inner = np.abs(curve["place"]) < 0.5
     assert np.all(curve["smooth_position_u"][-1, inner].mean(axis=0) < u.mean(axis=0))
 
@@ -129,17 +117,12 @@ def test_one_artefact_has_curves_over_time():
     assert curve["place"].tolist() == [PLACES[3]]
 
 
-@pytest.mark.parametrize("how", ["missing", "wrong"])
-def test_missing_and_wrong_points_are_excluded(how):
-    crossbeam, axis, found, rig = campaign(2)
+def test_missing_points_are_excluded():
+    crossbeam, twist, covariance, rig = campaign(2)
     gone = np.zeros((len(TIMES), len(PLACES)), dtype=bool)
     gone[4:, 2], gone[3, 5] = True, True
-    off = np.nan if how == "missing" else 1e-3  # a value that would show
-    axis.profiler[gone] = off
-    if how == "missing":
-        axis.profiler_covariance[gone] = np.nan
-        found.cold_share[gone] = np.nan
-    curve = drawn(axis, found, rig, wrong=gone if how == "wrong" else None)
+    twist[gone], covariance[gone] = np.nan, np.nan
+    curve = drawn(twist, covariance, rig)
     truth = crossbeam.twist(TIMES[:, None], curve["place"])
     assert np.isfinite(curve["smooth_position"]).all()
     assert np.all(np.abs(curve["smooth_position"] - truth) <= 5 * curve["smooth_position_u"] + 1e-12)
@@ -155,9 +138,9 @@ def test_missing_and_wrong_points_are_excluded(how):
 
 
 def test_artefact_without_scans_is_unknown_only_over_time():
-    crossbeam, axis, found, rig = campaign(3)
-    axis.profiler[:, 4], axis.profiler_covariance[:, 4], found.cold_share[:, 4] = np.nan, np.nan, np.nan
-    curve = drawn(axis, found, rig)
+    crossbeam, twist, covariance, rig = campaign(3)
+    twist[:, 4], covariance[:, 4] = np.nan, np.nan
+    curve = drawn(twist, covariance, rig)
     assert np.isnan(curve["smooth_time"][1:, 4]).all()
     assert np.isfinite(np.delete(curve["smooth_time"], 4, axis=1)).all()
     truth = crossbeam.twist(TIMES[:, None], curve["place"])

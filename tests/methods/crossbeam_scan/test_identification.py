@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registration import blocks, kernels
 from errormotion.methods.crossbeam_scan.settings import Settings
-from errormotion.montecarlo.trials import redrawing_of
+from errormotion.montecarlo.trials import redrawing_of, sample
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
@@ -48,7 +48,7 @@ def campaign(machine, seed, *, times=TIMES, places=PLACES, **options):
     )
 
 
-EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0}
+EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansion_uncertainty": 0.0}
 """The twin's artefacts do not expand, and its profiler keeps its scale."""
 
 
@@ -146,16 +146,15 @@ def test_a_guide_makes_pitch_certain(found):
     assert np.all(guided[..., 1] < 0.5 * free[..., 1])  # pitch acts over 2.2 m
 
 
-def test_trials_of_a_guided_carriage_draw_the_guide(campaigns, found, remembering):
-    """Most of the stated uncertainty of the pitch is that of the guide, which no redrawn reading contains."""
-    settings, errors = Settings(strain="guided", **EXACT), found["guided"][0]
+@pytest.mark.parametrize("strain", ["free", "guided"])
+def test_trials_have_the_stated_uncertainty(strain, campaigns, found, remembering):
+    settings, errors = Settings(strain=strain, **EXACT), found[strain][0]
     with remembering():
         drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
-    act, rng = drawn.sources["guide"].act, np.random.default_rng(1)
-    trials = np.array([act(errors, rng).em.twist().values[1:] for _ in range(300)])
-    share = trials.std(axis=0) / stated(errors)
-    assert np.all((share[..., 3] > 0.8) & (share[..., 3] < 1.1))
-    assert np.all(share < 1.1)
+    trials, reasons = sample(CrossbeamScan(), drawn, np.random.SeedSequence(1), range(60), (9, 6), list(drawn.sources))
+    assert not reasons
+    # 60 trials: 1 +- 0.09
+    assert trials[:, 3:].std(axis=0) / stated(errors).reshape(6, 6) == pytest.approx(1, abs=0.4)
 
 
 def test_rigid_registration_is_wrong_where_the_roll_changes(found, machines):
@@ -403,7 +402,7 @@ def test_scales_of_the_profiler_are_in_the_uncertainty_without_being_stated():
         scans = simulation.raw_scans(machine, [0.0, 3600.0], PLACES, seed=seed, **options)
         raw = stretched(scans, np.random.default_rng(seed))
         ds = CrossbeamScan().identify(raw, Settings(strain="rigid"))
-        assert [note for note in ds.attrs["notes"] if "scale_uncertainty" in note and "20 um/m is assumed" in note]
+        assert [note for note in ds.attrs["notes"] if "assumed to be 20 um/m" in note and "scale_uncertainty" in note]
         share.append(miss(ds, machine) / stated(ds))
         exact.append(miss(ds, machine) / stated(identify(raw, strain="rigid")))
     # Of 18 values of a freedom, 16 or more within the 95 % interval in 94 % of cases, 14 or more in 99.9 %.
@@ -415,4 +414,5 @@ def test_scales_of_the_profiler_are_in_the_uncertainty_without_being_stated():
 def test_exact_scales_are_not_noted(thin, thin_by_maps):
     assert "um/m" not in " ".join(thin_by_maps.attrs["notes"])
     stated = CrossbeamScan().identify(thin[1], Settings(scale_uncertainty=1e-5, strain="rigid")).attrs["notes"]
-    assert [note for note in stated if note.startswith("No uncertainty is stated of the expansion of the artefacts")]
+    assert [note for note in stated if note.endswith(": expansion_uncertainty, mount_expansion_uncertainty.")]
+    assert [note for note in stated if "50 mm: the height of the artefacts (artefact_height)" in note]

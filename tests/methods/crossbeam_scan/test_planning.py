@@ -21,7 +21,8 @@ from errormotion.twin.sensors.profiler import Disturbances, Profiler
 PLACES = (-0.4, 0.0, 0.4)
 WARM_UP = (1800.0, 7200.0)
 LAYOUT = {"width": 20e-3, "points": 800}
-NOTHING = {"lever_uncertainty": (0.0, 0.0, 0.0)}
+EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansion_uncertainty": 0.0}
+NOTHING = {"lever_uncertainty": (0.0, 0.0, 0.0)} | EXACT
 
 
 @pytest.fixture(autouse=True)
@@ -78,11 +79,11 @@ def test_plan_agrees_with_the_stated_uncertainty_of_the_identification(machine, 
         [0.0, 7200.0], [0.0], seed=1, profiles=400, feed=70e-6, motion=motion,
         profiler=Profiler(800, 25e-6, disturbances=wrong), artefact=freeform(waves),
     )  # fmt: skip
-    stated = CrossbeamScan().identify(raw, Settings(strain=strain))["registration_u"].values[1, 0]
+    stated = uncertainty(CrossbeamScan().identify(raw, Settings(strain=strain, **EXACT)))[1, 0]
     layout = LAYOUT | {"jitter_z": wrong.jitter_z, "jitter_y": wrong.jitter_y}
     planned = plan(
         strain=strain, positions=(0.0,), warm_up=(7200.0,), scan_length=28e-3, height_noise=wrong.noise,
-        layout=layout, **pose,
+        layout=layout, **pose, **EXACT,
     )  # fmt: skip
     assert uncertainty(planned)[1, 0] == pytest.approx(stated, rel=0.3)
 
@@ -96,7 +97,10 @@ def test_a_plan_of_scans_is_a_valid_dataset_of_zeros():
     assert not ds.em.twist().values.any()
     assert not uncertainty(ds)[0].any()  # cold
     assert np.all(uncertainty(ds)[1:] > 0)
-    assert ds.em.budget()["group"].values.tolist() == ["profiler pose", "lever", "independent"]
+    assert ds.em.budget()["group"].values.tolist() == [
+        *("profiler pose", "lever", "cold scan", "scale of the profiler", "expansion of the mount"),
+        *("expansion of the artefacts", "independent"),
+    ]
 
 
 def test_plan_without_positions_states_what_it_needs():
@@ -129,7 +133,7 @@ def test_guide_reduces_the_expected_uncertainty():
     ids=str,
 )
 def test_better_layout_reduces_the_expected_uncertainty(better):
-    usual, good = (registration_covariance(Settings(**changes)) for changes in ({}, better))
+    usual, good = (registration_covariance(Settings(**changes))[0] for changes in ({}, better))
     # in no direction worse, in some better
     known = np.diag(good)[:6] > 0
     values = np.linalg.eigvalsh((usual - good)[:6, :6][np.ix_(known, known)] * 1e12)
@@ -140,7 +144,7 @@ def test_better_layout_reduces_the_expected_uncertainty(better):
 def test_twice_the_noise_is_twice_the_uncertainty():
     still = {"jitter_z": 0.0, "jitter_y": 0.0}
     once, twice = (
-        registration_covariance(Settings(layout=still, height_noise=u, scale_uncertainty=0, expansion_uncertainty=0))
+        registration_covariance(Settings(layout=still, height_noise=u, scale_uncertainty=0, expansion_uncertainty=0))[0]
         for u in (0.5e-6, 1e-6)
     )
     assert twice == pytest.approx(4 * once, rel=1e-6)

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from errormotion.datasets import build_errors, provenance
+from errormotion.datasets.results.effects import change_of
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.report.figures import figures
 from errormotion.methods.crossbeam_scan.report.view import campaign
@@ -510,3 +511,11 @@ def test_figures_of_a_pose_are_its_errors_and_a_plan_has_none():
     assert [one.value for one in found] == [float(errors[name][0]) for name in ("EX", "EY", "EZ", "EA", "EB", "EC")]
     assert [one.expanded_uncertainty for one in found] == list(2 * np.sqrt(np.diag(errors["covariance"].values[0])))
     assert figures(errors.assign_attrs(reference="planned measurement")) == []
+
+
+def test_sources_of_a_figure_are_those_of_the_error_that_it_is(whole):
+    # many sources: the changes of a figure by each of them are not computed
+    for figure in figures(whole):
+        stated = [figure.influence[name] for name in whole["source"].values]
+        changes = [change_of(whole, row, figure.name) for row in range(whole.sizes["source"])]
+        assert stated == pytest.approx(changes, rel=1e-9, abs=1e-15)

@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.identification.chain import carriage_errors
+from errormotion.methods.crossbeam_scan.identification.chain import Rig, carriage_errors
 from errormotion.methods.crossbeam_scan.identification.cutting import Scan, Scans
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, prepare, register
 
@@ -151,11 +151,10 @@ def _text(cold: BlockMap, warm: BlockMap, raw: xr.Dataset) -> str:
     """Return the errors of the carriage with the standard uncertainty of the registration, in um and arcsec."""
     found = register(cold, warm, point=np.zeros(3))
     pose = RigidTransform.from_matrix(np.asarray(raw["profiler_pose"].values, dtype=float))
-    errors = carriage_errors(found.twist, found.covariance, pose, raw["lever"].values)
-    size = np.sqrt(np.diag(errors.covariance))
-    shown = [f"E{k} {v * 1e6:+.1f} ({u * 1e6:.2f})" for k, v, u in zip("XYZ", errors.values, size, strict=False)]
+    errors, covariance = carriage_errors(found.twist, found.covariance, Rig(pose, raw["lever"].values))
+    size = np.sqrt(np.diag(covariance))
+    shown = [f"E{k} {v * 1e6:+.1f} ({u * 1e6:.2f})" for k, v, u in zip("XYZ", errors, size, strict=False)]
     turns = [
-        f"E{k} {v * _ARCSEC:+.2f} ({u * _ARCSEC:.2f})"
-        for k, v, u in zip("ABC", errors.values[3:], size[3:], strict=True)
+        f"E{k} {v * _ARCSEC:+.2f} ({u * _ARCSEC:.2f})" for k, v, u in zip("ABC", errors[3:], size[3:], strict=True)
     ]
     return f"{' '.join(shown)} um, {' '.join(turns)} arcsec"

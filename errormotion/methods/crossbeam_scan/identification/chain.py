@@ -1,17 +1,31 @@
-"""From the registered motion of the profiler's frame to the six errors of the carriage, and the effect of a wrong pose.
+"""The chain: from a registered map to the motion of the profiler's frame, and on to the six errors of the carriage.
 
 M registers a warm scan onto the cold one: a point at p in the warm profiler frame is at M p in the cold one. With H the
 pose of the profiler in the tool frame and S the shift by the lever (x_y, 0, z_y), the error of the carriage is the
 conjugate E = S H M (S H)^-1 (eq. 3 of Zhao et al.), for small motions the adjoint of S H applied to the twist of M. The
 remainder is of second order: lever times angle squared, 1 nm at 2 m and 30 urad.
 
-A scan is assembled along the feed. The carriage travels along Y of the machine: line y is displaced from the profiler's
-plane by y times `feed_direction`, which is Y of the machine in the profiler's frame, not Y of that frame.
+A scan is assembled along the feed, and it is not rigid, because the carriage moves during the feed. The carriage
+travels along Y of the machine: line y is displaced from the profiler's plane by y times `feed_direction` f, which is Y
+of the machine in the profiler's frame, not Y of that frame. A line at the feed s measures (x, 0, z). In the cold frame
+at the artefact's middle, this point is P = (x, 0, z) + s f. The registered map is Q = (x, s, z), so that P = B Q with
+
+    B = 1 + (f - e_y) e_y^T .
+
+The warm carriage displaces a point by T + r x (x, 0, z) + s g: (T, r) is the twist of the profiler at its origin when
+the axis is over the artefact's middle, and g = dT/dY is its change along the scan. (For a rigid scan, g = r x f.) Two
+maps differ by B^-1 times this; the registration states it as a twist (T_Q, R_Q) at the origin and displacements c per
+metre of feed. Comparison of the coefficients of 1, x, z and s results in
+
+    EC = f_y EC_Q,   EA = f_y EA_Q,   EB = EB_Q - f_z EC_Q,   T = B T_Q,   g = B (c + R_Q x e_y) .
+
+Yaw and pitch are determined by the relief along the lines alone: pitch EA moves a point along the feed by -z EA. The
+slope along the feed would show both if the scan were rigid, but it is g, which does not depend on them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,89 +37,70 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.poses import adjoint_of
 from errormotion.kinematics.twists import adjoint, cross_matrix, transform, transform_covariance
 
-#: Names of the influences, and their groups in the budget.
 SOURCES = (*(f"profiler pose {k}" for k in range(1, 7)), "lever x", "lever y", "lever z")
-SOURCE_GROUPS = ("profiler pose",) * 6 + ("lever",) * 3
+"""Names of the sources of pose and lever."""
 POSE_UNIT = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])
 """Units of (a, b, g, dx, dy, dz) in which the principal axes of their covariance are determined, rad and m."""
 
 
 @dataclass(frozen=True)
-class CarriageErrors:
-    """Thermal errors of the carriage at its origin, in machine directions.
+class Rig:
+    """Pose of the profiler and lever, with their uncertainty.
 
     Attributes
     ----------
-    values : ndarray, (..., 6)
-        EX EY EZ in m, EA EB EC in rad; NaN where there was no registration.
-    covariance : ndarray, (..., 6, 6)
-        Of the registration and the influences together.
-    influence : ndarray, (source, ..., 6)
-        Effect of one standard uncertainty of each source, the same draw for all values.
-    sources, source_groups : tuple of str
-        Names and groups of the influences, for `errormotion.datasets.build_errors`.
+    pose : RigidTransform
+        H, profiler to tool frame.
+    lever : ndarray, (3,)
+        (x_y, 0, z_y), carriage to tool frame, m.
+    pose_covariance : ndarray, (6, 6), optional
+        Of (a, b, g, dx, dy, dz), from the calibration; without it the pose is taken as exact.
+    lever_uncertainty : ndarray, (3,)
+        m.
     """
 
-    values: Array
-    covariance: Array
-    influence: Array
-    sources: tuple[str, ...] = SOURCES
-    source_groups: tuple[str, ...] = SOURCE_GROUPS
+    pose: RigidTransform
+    lever: Array
+    pose_covariance: Array | None = None
+    lever_uncertainty: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def feed_direction(profiler_pose: RigidTransform) -> Array:
     """Return the direction of the feed (Y of the machine) in the profiler's frame, (..., 3)."""
-    return np.asarray(profiler_pose.rotation.inv().apply([0.0, 1.0, 0.0]))
+    return np.asarray(profiler_pose.as_matrix()[..., 1, :3])
 
 
-def carriage_errors(
-    motion: ArrayLike,
-    covariance: ArrayLike,
-    profiler_pose: RigidTransform,
-    lever: ArrayLike,
-    *,
-    pose_covariance: ArrayLike | None = None,
-    lever_uncertainty: ArrayLike = (0.0, 0.0, 0.0),
-) -> CarriageErrors:
-    """Return the errors of the carriage from the registered motions of the profiler's frame.
+def from_maps(profiler_pose: RigidTransform) -> Array:
+    """Return the matrix (..., 9, 9) that converts (T_Q, R_Q, c) at the map's origin to (T, r, g)."""
+    f = feed_direction(profiler_pose)
+    B = np.zeros((*f.shape, 3)) + np.eye(3)
+    B[..., 1] = f
+    W = np.zeros((*f.shape[:-1], 9, 9))
+    W[..., :3, :3] = W[..., 6:, 6:] = B
+    W[..., 3, 3] = W[..., 5, 5] = f[..., 1]
+    W[..., 4, 4], W[..., 4, 5] = 1.0, -f[..., 2]
+    W[..., 6:, 3:6] = B @ -cross_matrix(np.array([0.0, 1.0, 0.0]))
+    return W
+
+
+def carriage_errors(motion: ArrayLike, covariance: ArrayLike, rig: Rig) -> tuple[Array, Array]:
+    """Return the errors of the carriage (..., 6) from motions of the profiler, and their covariance (..., 6, 6).
+
+    Pose and lever are contained to first order: an error of the frame changes a twist by their Lie bracket.
 
     Parameters
     ----------
-    motion : (..., 6)
+    motion, covariance : (..., 6), (..., 6, 6)
         Twists of M at the origin of the profiler's frame, in that frame: warm onto cold; m and rad.
-    covariance : (..., 6, 6)
-        Covariance of the twists from the registration alone.
-    profiler_pose : RigidTransform
-        H, profiler to tool frame.
-    lever : (3,)
-        (x_y, 0, z_y), carriage to tool frame, m.
-    pose_covariance : (6, 6), optional
-        Of (a, b, g, dx, dy, dz), from the calibration; without it the pose is taken as exact.
-    lever_uncertainty : (3,)
-        Standard uncertainty of the lever, m.
-
-    Raises
-    ------
-    MethodError
-        Shapes that do not fit.
+    rig : Rig
     """
-    M, C, x = (np.asarray(value, dtype=float) for value in (motion, covariance, lever))
-    if M.shape[-1:] != (6,) or C.shape != (*M.shape, 6) or x.shape != (3,):
-        raise MethodError(
-            "Expected motions (..., 6), covariances (..., 6, 6) and a lever (3,); found "
-            f"{M.shape}, {C.shape} and {x.shape}."
-        )
-    to_carriage = carriage_adjoint(profiler_pose, x)
-    E = transform(M, to_carriage)
-    errors = np.concatenate(
-        [
-            root(pose_covariance) @ pose_twists(profiler_pose, x),
-            np.asarray(lever_uncertainty, dtype=float)[:, None] * np.eye(3, 6),
-        ]
-    )
-    influence = np.stack([commutator(error, E) for error in errors])
-    total = transform_covariance(C, to_carriage) + np.einsum("s...i,s...j->...ij", influence, influence)
-    return CarriageErrors(E, total, influence)
+    to_carriage = carriage_adjoint(rig.pose, rig.lever)
+    E = transform(np.asarray(motion, dtype=float), to_carriage)
+    of_lever = np.diag(rig.lever_uncertainty) @ np.eye(3, 6)
+    sources = [*(root(rig.pose_covariance) @ pose_twists(rig.pose, rig.lever)), *of_lever]
+    effects = np.stack([commutator(error, E) for error in sources])
+    C = transform_covariance(np.asarray(covariance, dtype=float), to_carriage)
+    return E, C + np.einsum("s...i,s...j->...ij", effects, effects)
 
 
 def carriage_adjoint(profiler_pose: RigidTransform, lever: ArrayLike) -> Array:

@@ -21,13 +21,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
 from errormotion.estimation.smoothing import smooth_vectors
-from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig
-from errormotion.methods.crossbeam_scan.identification.chain import CarriageErrors, carriage_errors
-from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
+from errormotion.methods.crossbeam_scan.identification.chain import Rig, carriage_errors
 
 PLACES, MOMENTS = 41, 41
 """Number of points of a curve over position and over time."""
@@ -40,30 +38,19 @@ def warm_up_scale(time: ArrayLike) -> Array:
     return np.log1p(np.asarray(time, dtype=float) / LINEAR_TIME)
 
 
-def curves(
-    axis: Carriage,
-    found: Registrations,
-    rig: Rig,
-    positions: Array,
-    time: Array,
-    warm: list[int],
-    wrong: NDArray[np.bool_],
-) -> dict[str, Any]:
+def curves(twist: Array, covariance: Array, cold: Array, rig: Rig, positions: Array, time: Array) -> dict[str, Any]:
     """Return the curves as extra results of the error dataset.
 
     Parameters
     ----------
-    axis : Carriage
-    found : Registrations
+    twist, covariance, cold : (cycle, artefact, 6), (cycle, artefact, 6, 6), (cycle, artefact, 6, 6)
+        Motion of the profiler, its covariance, and what of it the cold scans cause; NaN for points that are not used.
+        The first cycle is the cold one.
     rig : Rig
     positions : (artefact,)
         m.
-    time : (warm cycle,)
-        s, above 0.
-    warm : list of int
-        The cycles.
-    wrong : (cycle, artefact)
-        Points to exclude, because an artefact has moved.
+    time : (cycle,)
+        s, 0 for the cold one.
 
     Returns
     -------
@@ -71,26 +58,23 @@ def curves(
         ``smooth_position`` and ``_u`` (time, place, dof), the cold cycle first and zero; ``smooth_time`` and ``_u``
         (moment, position, dof); ``place`` m, ``moment`` s.
     """
-    e = np.where(wrong[warm][..., None], np.nan, axis.profiler[warm])
-    C = axis.profiler_covariance[warm]
+    e, C, common = twist[1:], covariance[1:], cold[1:]
     place = np.linspace(positions[0], positions[-1], PLACES) if positions.size > 1 else positions.copy()
     over = smooth_vectors(positions, e, C, place)
     position, position_u = _chained(over.values, over.covariance, rig)
-    cold = np.zeros((1, *position.shape[1:]))
+    zero = np.zeros((1, *position.shape[1:]))
 
     moment = np.linspace(0.0, time[-1], MOMENTS)
-    share = found.cold_share[warm]
-    e, C, share = (np.swapaxes(value, 0, 1) for value in (e, C, share))  # artefact, cycle
-    own = C * (1 - share)[..., None, None]
-    along = smooth_vectors(warm_up_scale(time), e, own, warm_up_scale(moment), exact_zero=True)
-    common = np.linalg.cholesky(_regularised(C * share[..., None, None]))  # one draw for all cycles of an artefact
-    effect = along.carry(np.moveaxis(common, -1, 0))  # (6, artefact, moment, 6)
+    e, own, common = (np.swapaxes(value, 0, 1) for value in (e, C - common, common))  # artefact, cycle
+    along = smooth_vectors(warm_up_scale(time[1:]), e, own, warm_up_scale(moment), exact_zero=True)
+    roots = np.linalg.cholesky(_regularised(common))  # one draw for all cycles of an artefact
+    effect = along.carry(np.moveaxis(roots, -1, 0))  # (6, artefact, moment, 6)
     total = along.covariance + np.einsum("s...i,s...j->...ij", effect, effect)
     over_time, over_time_u = _chained(along.values, total, rig)
     return {
         "place": ("place", place, {"units": "m"}),
-        "smooth_position": (("time", "place", "dof"), np.concatenate([cold, position])),
-        "smooth_position_u": (("time", "place", "dof"), np.concatenate([cold, position_u])),
+        "smooth_position": (("time", "place", "dof"), np.concatenate([zero, position])),
+        "smooth_position_u": (("time", "place", "dof"), np.concatenate([zero, position_u])),
         "moment": ("moment", moment, {"units": "s"}),
         "smooth_time": (("moment", "position", "dof"), np.swapaxes(over_time, 0, 1)),
         "smooth_time_u": (("moment", "position", "dof"), np.swapaxes(over_time_u, 0, 1)),
@@ -99,15 +83,8 @@ def curves(
 
 def _chained(twist: Array, covariance: Array, rig: Rig) -> tuple[Array, Array]:
     """Return errors of the carriage and their standard uncertainty, pose and lever included."""
-    found: CarriageErrors = carriage_errors(
-        twist,
-        covariance,
-        rig.pose,
-        rig.lever,
-        pose_covariance=rig.pose_covariance,
-        lever_uncertainty=rig.lever_uncertainty,
-    )
-    return found.values, np.sqrt(np.diagonal(found.covariance, axis1=-2, axis2=-1))
+    E, C = carriage_errors(twist, covariance, rig)
+    return E, np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
 
 def _regularised(C: Array) -> Array:

@@ -7,26 +7,34 @@ the campaign may be larger than memory.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.cutting import Scan
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
-from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem
-from errormotion.methods.crossbeam_scan.identification.strain import DRIFT, FEED
+from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 log = logging.getLogger(__name__)
 
+FEED = ("feed_x", "feed_y", "feed_z")
+"""Parameters of the registration that describe the drift along a scan."""
+DRIFT = 1e-3
+"""Standard deviation of their prior, 1: a millimetre per metre, far more than the drift of any carriage. With it, an
+artefact of little relief results in a large uncertainty instead of an error."""
+STRAINS = ("scale_x", "scale_z", "expansion")
+"""Scales of the profiler and expansion of the artefact between cold and warm, whose uncertainty settings state."""
 COARSE = 1.5
 """Ratio of the bending of a block to the noise of a point beyond which a note is given."""
 MAP_SIZE = 40
@@ -59,7 +67,9 @@ class Registrations:
     twist : ndarray, (cycle, artefact, 9)
         (T_Q, R_Q, drift per feed) at the map's origin; NaN where there is none.
     covariance : ndarray, (cycle, artefact, 9, 9)
-        Of ``twist``.
+        Of ``twist``, from the noise of both scans.
+    effect : ndarray, (cycle, artefact, 9, 3)
+        Error of ``twist`` by one unit of each of the `STRAINS`, m/m, which are taken as 0 within their priors.
     cold_share : ndarray, (cycle, artefact)
         Share of the covariance that is caused by the noise of the cold scan.
     bound : ndarray, (artefact, 9, 9)
@@ -79,6 +89,7 @@ class Registrations:
     cold: NDArray[np.int64]
     twist: Array
     covariance: Array
+    effect: Array
     cold_share: Array
     bound: Array
     reason: NDArray[np.object_]
@@ -87,11 +98,58 @@ class Registrations:
     maps: list[Maps | None] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def without(self, excluded: NDArray[np.bool_]) -> Registrations:
-        """Return the registrations with NaN where ``excluded`` (cycle, artefact) is True."""
-        twist, covariance = self.twist.copy(), self.covariance.copy()
-        twist[excluded], covariance[excluded] = np.nan, np.nan
-        return replace(self, twist=twist, covariance=covariance)
+    @classmethod
+    def empty(cls, cycles: int, artefacts: int, cold: ArrayLike = -1) -> Registrations:
+        """Return what is filled in; nothing is registered."""
+        shape = cycles, artefacts
+        return cls(
+            cold=np.zeros(artefacts, dtype=int) + np.asarray(cold),
+            twist=np.full((*shape, 9), np.nan),
+            covariance=np.full((*shape, 9, 9), np.nan),
+            effect=np.zeros((*shape, 9, 3)),
+            cold_share=np.full(shape, np.nan),
+            bound=np.full((artefacts, 9, 9), np.nan),
+            reason=np.full(shape, "", dtype=object),
+            quality={name: np.full(shape, np.nan) for name in QUALITY} | {"points_used": np.zeros(shape)},
+            time=np.full(shape, np.nan),
+        )
+
+    @classmethod
+    def stated(cls, raw: xr.Dataset) -> Registrations:
+        """Return the registrations of raw data that contain them instead of scans."""
+
+        def values(name: str, *dims: str) -> Array:
+            return np.array(raw[name].transpose("cycle", *dims).values, dtype=float)
+
+        found = cls.empty(raw.sizes["cycle"], raw.sizes["artefact"])
+        for name, part in (("displacement", slice(0, 3)), ("rotation", slice(3, 6))):
+            found.twist[..., part] = values(name, "artefact", "direction")
+        found.twist[..., 6:] = 0.0
+        found.covariance[:] = 0.0
+        found.covariance[..., :6, :6] = values("registration_covariance", "artefact", "registered", "registered_")
+        known = np.isfinite(found.twist).all(axis=-1) & np.isfinite(found.covariance).all(axis=(-2, -1))
+        found.twist[~known], found.covariance[~known] = np.nan, np.nan
+        found.reason[~known] = "there is no registration"
+        found.cold[known.any(axis=0)] = 0
+        if "strain_effect" in raw:
+            found.effect[..., :6, :] = values("strain_effect", "artefact", "registered", "strain")
+        found.cold_share[:] = values("cold_share", "artefact")
+        found.time[:] = values("time")[:, None]
+        return found
+
+    def of_cycles(self, rows: Sequence[int], excluded: NDArray[np.bool_] | None = None) -> Registrations:
+        """Return the registrations of some cycles, NaN where ``excluded`` (cycle, artefact) is True."""
+        out = np.zeros(self.reason.shape, dtype=bool) if excluded is None else excluded
+        return replace(
+            self,
+            twist=np.where(out[..., None], np.nan, self.twist)[rows],
+            covariance=self.covariance[rows],
+            effect=self.effect[rows],
+            cold_share=self.cold_share[rows],
+            reason=self.reason[rows],
+            quality={name: values[rows] for name, values in self.quality.items()},
+            time=self.time[rows],
+        )
 
 
 @dataclass
@@ -120,19 +178,8 @@ def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, 
         Stated standard deviation of one height, m, for the bound.
     settings : Settings
     """
-    shape = scans.cycles, scans.artefacts
-    found = Registrations(
-        cold=np.full(shape[1], -1),
-        twist=np.full((*shape, 9), np.nan),
-        covariance=np.full((*shape, 9, 9), np.nan),
-        cold_share=np.full(shape, np.nan),
-        bound=np.full((shape[1], 9, 9), np.nan),
-        reason=np.full(shape, "", dtype=object),
-        quality={name: np.full(shape, np.nan) for name in QUALITY},
-        time=np.full(shape, np.nan),
-    )
-    found.quality["points_used"][:] = 0
-    for artefact in range(shape[1]):
+    found = Registrations.empty(scans.cycles, scans.artefacts)
+    for artefact in range(scans.artefacts):
         found.maps.append(_artefact(scans, artefact, cold_cycles, height_noise, settings, found))
     return found
 
@@ -164,7 +211,9 @@ def _artefact(
                 found.quality["points_used"][cycle, k] = cold.points.sum()
                 continue
             result = _register(cold, warm, settings)
-            _store(result, found, cycle, k)
+            _store(result, settings.strains(), found, cycle, k)
+            if settings.registration != "height_map":
+                found.effect[cycle, k, :6] = _of_strains(cold, warm, result)
             _store_maps(maps, cold, warm, result, cycle)
             _store_quality(result, warm, found.quality, cycle, k)
         except MethodError as error:
@@ -209,23 +258,51 @@ def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registratio
     if settings.registration == "height_map":
         if settings.strain != "rigid":
             extra |= dict.fromkeys(FEED, DRIFT)
-        extra |= settings.strains()
+        extra |= estimated(settings)
     return register(
         cold, warm, registration=settings.registration, point=np.zeros(3), line_effects=settings.line_effects,
         extra=extra,
     )  # fmt: skip
 
 
-def _store(result: Registration, found: Registrations, cycle: int, k: int) -> None:
-    """Store the twist and the drift along the feed; where it is no parameter, the drift is 0 without uncertainty."""
-    names = [name for name in FEED if name in result.extra_names]
-    source = [*range(6), *(6 + result.extra_names.index(name) for name in names)]
-    target = [*range(6), *(6 + FEED.index(name) for name in names)]
+def estimated(settings: Settings) -> dict[str, float]:
+    """Return the priors of the strains that are not exact, by their parameter."""
+    return {name: sigma for name, sigma in settings.strains().items() if name in STRAINS and sigma > 0}
+
+
+def _store(result: Registration, strains: Mapping[str, float], found: Registrations, cycle: int, k: int) -> None:
+    """Store the twist and the drift along the feed; where it is no parameter, the drift is 0 without uncertainty.
+
+    The estimate z shifts with the mean m of the prior of a strain s by dz/dm = C_zs / sigma^2. A strain s about which
+    the prior is 0 is therefore an error -C_zs / sigma^2 s of it, and C_zz - C_zs C_sz / sigma^2 is left to the noise.
+    """
+    extra = {name: 6 + i for i, name in enumerate(result.extra_names)}
+    source = [*range(6), *(extra[name] for name in FEED if name in extra)]
+    target = [*range(6), *(6 + i for i, name in enumerate(FEED) if name in extra)]
+    C = result.joint_covariance
     found.twist[cycle, k] = 0.0
     found.twist[cycle, k, target] = np.concatenate([result.twist, result.extra])[source]
     found.covariance[cycle, k] = 0.0
-    found.covariance[cycle, k][np.ix_(target, target)] = result.joint_covariance[np.ix_(source, source)]
+    found.covariance[cycle, k][np.ix_(target, target)] = C[np.ix_(source, source)]
+    for column, name in enumerate(STRAINS):
+        if name in extra:
+            effect = -C[source, extra[name]] / strains[name] ** 2
+            found.effect[cycle, k, target, column] = effect
+            found.covariance[cycle, k][np.ix_(target, target)] -= strains[name] ** 2 * np.outer(effect, effect)
     found.cold_share[cycle, k] = result.cold_share
+
+
+def _of_strains(cold: BlockMap, warm: BlockMap, result: Registration) -> Array:
+    """Return the error (6, 3) by a unit of each strain of a registration that estimates none of them.
+
+    The strains s move the blocks by J_s s, which rigid motions take on as (J'J)^-1 J'J_s s; about the origin instead of
+    the middle c of the map, a strain moves the artefact by -G c besides.
+    """
+    terms = Extra.of(dict.fromkeys(STRAINS, np.inf))
+    problem = Problem.of(cold, warm, extra=terms)
+    A = problem.evaluate(State.of(result.pose, len(STRAINS))).A.sum(axis=0)
+    moved = terms.about(result.point - problem.centre)
+    return np.asarray(moved[:6, :6] @ np.linalg.solve(A[:6, :6], A[:6, 6:]) - moved[:6, 6:])
 
 
 def _store_quality(result: Registration, warm: BlockMap, quality: dict[str, Array], cycle: int, k: int) -> None:

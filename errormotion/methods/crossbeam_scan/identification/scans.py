@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,18 +13,23 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_errors, provenance
+from errormotion.datasets import hash_dataset, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.identification.artefact_check import MOVED, ArtefactCheck, check_artefacts
-from errormotion.methods.crossbeam_scan.identification.carriage import Carriage, Rig, carriage
-from errormotion.methods.crossbeam_scan.identification.chain import SOURCES, pose_identities
+from errormotion.estimation.variance import Verdict
+from errormotion.measurement.identification import dataset, solve
+from errormotion.measurement.observed import Observed, Solved
+from errormotion.methods.crossbeam_scan.identification import chain
+from errormotion.methods.crossbeam_scan.identification.artefacts import MOVED, ArtefactCheck, check_artefacts
+from errormotion.methods.crossbeam_scan.identification.chain import Rig
 from errormotion.methods.crossbeam_scan.identification.curves import curves
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
-from errormotion.methods.crossbeam_scan.identification.registrations import Maps, Registrations, register_all
-from errormotion.methods.crossbeam_scan.settings import STRAIN
+from errormotion.methods.crossbeam_scan.identification.model import Campaign
+from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, Maps, Registrations, register_all
+from errormotion.methods.crossbeam_scan.settings import HEIGHT, STRAIN
 
 if TYPE_CHECKING:
+    from errormotion.measurement import ModelMethod
     from errormotion.methods.crossbeam_scan.settings import Settings
 
 
@@ -36,52 +41,186 @@ DOMINANCE = 10.0
 _STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]  # in the provenance
 
 
-def identify_scans(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+def identify_scans(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
     """Return the errors of the axis over time and position.
 
     Parameters
     ----------
+    method : ModelMethod
+        The plugin.
     raw : Dataset
-        Variant "scans" or "scans as recorded"; read scan by scan.
+        Any variant but "profiler pose"; read scan by scan.
     settings : Settings
-    method, version : str
-        Of the plugin.
 
     Raises
     ------
     MethodError
         No scan could be registered; the message states the reasons.
     """
-    scans = Scans(raw)
+    # The hash reads all raw data once more, at the same time as the scans are registered.
+    with ThreadPoolExecutor(1) as pool:
+        digest = pool.submit(hash_dataset, raw)
+        observed, evaluated = observe(raw, settings)
+    solved = solve(observed)
+    origin = provenance.make(settings, raw, None, steps=_STEPS, raw_hash=digest.result())
+    extras, labels = evaluated.extras(solved)
+    pitch = _pitch_note(evaluated.campaign.of_registrations(solved)) if settings.strain == "free" else []
+    complete = replace(
+        solved.observed,
+        extras=extras,
+        coords=dict(observed.coords) | labels,
+        notes=[*solved.observed.notes, *pitch],
+    )
+    found = dataset(method, replace(solved, observed=complete), raw, method.info, origin)
+    for note in found.em.notes:
+        log.warning(note)
+    return found
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What the scans of a campaign say before the errors are solved.
+
+    Attributes
+    ----------
+    every : Campaign
+        Of all cycles.
+    campaign : Campaign
+        Of the cycles in ``rows``: the cold reference and the warm ones, without the scans of artefacts that moved.
+    rows, cold : list of int
+        Cycles; those of ``cold`` after the first are repeats of it.
+    time : ndarray, (row,)
+        s since the start of the warm-up.
+    check : ArtefactCheck
+    reason : ndarray of str, (row, artefact)
+        Why an error is unknown.
+    """
+
+    every: Campaign
+    campaign: Campaign
+    rows: list[int]
+    cold: list[int]
+    time: Array
+    check: ArtefactCheck
+    reason: NDArray[np.object_]
+
+    def extras(self, solved: Solved) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
+        """Return the further results without coordinates, and their coordinates."""
+        campaign, found, rig = self.campaign, self.campaign.found, self.campaign.rig
+        two = ("time", "position")
+        quality = found.quality
+        W = chain.from_maps(rig.pose)
+        u = _sigma(campaign.of_registrations(solved))
+        jitter = np.stack([quality["jitter_z"], quality["jitter_y"]], axis=-1)
+        out: dict[str, Any] = {
+            "reason": (two, self.reason.astype(str)),
+            "scan_time": (two, found.time, {"units": "s"}),
+            "registration_u": ((*two, "dof"), u),
+            "predicted_u": ((*two, "dof"), np.broadcast_to(_sigma(campaign.predicted()), u.shape)),
+            "residual_rms": (two, quality["residual_rms"], _METRES),
+            "points_used": (two, quality["points_used"].astype(np.int64)),
+            "noise_found": (two, quality["noise_found"], _METRES),
+            "line_jitter": ((*two, "jitter"), jitter, _METRES),
+            "condition": (two, quality["condition"]),
+            "strain": ((*two, "direction"), found.twist @ W[6:].T),
+            "profiler_pose": (("row", "column"), rig.pose.as_matrix()),
+            "lever": ("direction", rig.lever, _METRES),
+        }
+        if rig.pose_covariance is not None:
+            out["pose_u"] = ("pose_parameter", np.sqrt(np.diag(rig.pose_covariance)))
+        out |= self._repeats() | _map_extras(found.maps, self.rows) | self.check.extras()
+        twist, covariance, by_cold = campaign.solved_profiler(solved)
+        twist = np.where(self.check.wrong[self.rows][..., None], np.nan, twist)  # also where they are kept
+        out |= curves(twist, covariance, by_cold, rig, campaign.positions, self.time)
+        coords: dict[str, Any] = {name: out.pop(name) for name in ("place", "moment")}
+        coords |= {"jitter": ["z", "y"], "direction": list("xyz")}
+        if "pose_u" in out:
+            coords["pose_parameter"] = ["a", "b", "g", "dx", "dy", "dz"]
+        return {name: xr.DataArray(xr.Variable(*parts)) for name, parts in out.items()}, coords
+
+    def _repeats(self) -> dict[str, Any]:
+        """Return the errors by repeated cold scans."""
+        every = self.every.found
+        own = np.arange(self.every.shape[0])[:, None] == every.cold  # a reference is 0 by definition
+        found = every.of_cycles(self.cold, own)
+        seen = np.isfinite(found.twist[1:, :, 0])
+        if not (seen | own[self.cold[1:]]).any():
+            return {}
+        values, u = np.full((*seen.shape, 6), np.nan), np.full((*seen.shape, 6), np.nan)
+        if seen.any():
+            repeated = replace(self.every, found=found)
+            solved = solve(repeated.observed(coords={}, reference=""))
+            values = solved.relative.errors.value.reshape(*repeated.shape, 6)[1:]
+            u = _sigma(repeated.of_registrations(solved))[1:]
+        values[own[self.cold[1:]]], u[own[self.cold[1:]]] = 0.0, 0.0
+        some = np.isfinite(values).any(axis=(1, 2))
+        dims = ("repeat", "position", "dof")
+        return {"cold_repeat": (dims, values[some]), "cold_repeat_u": (dims, u[some])}
+
+
+def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
+    """Return what the raw data of scans mean, and what they say besides.
+
+    Raises
+    ------
+    MethodError
+        No scan could be registered; the message states the reasons.
+    """
     positions = np.asarray(raw["position"].values, dtype=float)
     if np.any(np.diff(positions) <= 0):
         raise MethodError(f"position: expected increasing positions of the artefacts; found {positions.tolist()} m")
-    cold = cold_cycles(raw, scans.cycles)
-    # The hash reads all raw data once more, at the same time as the scans are registered.
-    with ThreadPoolExecutor(1) as pool:
-        origin = pool.submit(provenance.make, settings, raw, None, steps=_STEPS)
+    if measured := "displacement" not in raw:
+        scans = Scans(raw)
+        cycles, corrected = scans.cycles, scans.notes
+        cold = cold_cycles(raw, cycles)
         found = register_all(scans, cold, float(raw["height_noise"]), settings)
-    rig = rig_of(raw)
-    axis = carriage(found, positions, rig, guide=None)
-    warm = [c for c in range(scans.cycles) if c not in cold]
+    else:
+        cycles, corrected = raw.sizes["cycle"], list[str]()
+        cold = cold_cycles(raw, cycles)
+        found = Registrations.stated(raw)
+    warm = [c for c in range(cycles) if c not in cold]
     if not warm:
-        raise MethodError(f"Expected warm scans after the cold ones; found {scans.cycles} cycles, all of them cold")
-    if not np.isfinite(axis.values[warm]).any():
+        raise MethodError(f"Expected warm scans after the cold ones; found {cycles} cycles, all of them cold")
+    if not np.isfinite(found.twist[warm]).any():
         reasons = sorted({reason for reason in found.reason.ravel() if reason})
         raise MethodError(
             f"None of {len(warm) * positions.size} warm scans could be registered onto its cold scan: "
             + "; ".join(reasons[:3])
         )
     rows = [cold[0], *warm]
-    time = cycle_times(found.time, rows, _planned(raw, scans.cycles))
+    time = cycle_times(found.time, rows, _planned(raw, cycles))
+    guide = settings.guide_uncertainty if settings.strain == "guided" else None
+    strains = np.array([settings.strains()[name] for name in (*STRAINS, "mount")])
+    every = Campaign(found, positions, rig_of(raw), guide, strains, settings.height_of_artefacts())
     # The check comes before the guide, which couples neighbours.
-    check = check_artefacts(axis, found, settings, positions, time[1:], cold, warm)
-    if settings.strain == "guided":
-        excluded = check.wrong & (settings.moved == "exclude")
-        axis = carriage(found.without(excluded), positions, rig, guide=settings.guide_uncertainty)
-    return _dataset(
-        raw, settings, method, version, found, axis, rig, check, cold, rows, time, scans.notes, origin.result()
+    check = check_artefacts(every, settings, time[1:], cold, warm)
+    excluded = check.wrong & (settings.moved == "exclude")
+    campaign = replace(every, found=found.of_cycles(rows, excluded))
+    reason = np.where(excluded, MOVED, found.reason)[rows]
+    reason[0, found.cold >= 0] = ""
+    for_frame = {} if settings.carriage_origin is None else {"frame_origin": np.array(settings.carriage_origin)}
+    observed = campaign.observed(
+        coords={"time": time, "y": ("position", positions, _METRES)},
+        reference="cold scans of the artefacts, before the warm-up",
+        attributes={
+            "start": warm_up_start(raw, found.time, cold),
+            "reference_sources": campaign.cold_names,
+            "reference_interval": (0.0, 0.0),
+        },
+        attrs={"registration": settings.registration, "strain": settings.strain, **for_frame},
+        finish=_finished if measured else None,
+        record=None if measured else campaign.recorded,
+        notes=[*_notes(reason, positions, campaign.rig), *_strain_notes(settings), *check.notes, *corrected],
+        doubts=[*check.doubts, *found.notes],
     )
+    return observed, Evaluated(every, campaign, rows, cold, time, check, reason)
+
+
+def _finished(solved: Solved) -> Solved:
+    """Return a solution without the note that its noise is unchecked: registrations find it in their residuals."""
+    if solved.scatter.verdict is Verdict.MORE:
+        return solved
+    return replace(solved, scatter=replace(solved.scatter, note=""))
 
 
 def cold_cycles(raw: xr.Dataset, cycles: int) -> list[int]:
@@ -108,72 +247,6 @@ def rig_of(raw: xr.Dataset) -> Rig:
         known("pose_covariance"),
         np.zeros(3) if uncertainty is None else uncertainty,
     )
-
-
-def _dataset(
-    raw: xr.Dataset,
-    settings: Settings,
-    method: str,
-    version: str,
-    found: Registrations,
-    axis: Carriage,
-    rig: Rig,
-    check: ArtefactCheck,
-    cold: list[int],
-    rows: list[int],
-    time: Array,
-    corrected: list[str],
-    origin: Mapping[str, Any],
-) -> xr.Dataset:
-    warm = rows[1:]
-    position = np.asarray(raw["position"].values, dtype=float)
-    reference = np.asarray(np.isfinite(axis.values[cold][:, :, 0]).any(axis=0))
-    values, own, influence = axis.values[rows], axis.covariance[rows], axis.influence[:, rows]
-    values[0] = np.where(reference[:, None], 0.0, np.nan)  # whichever cold scan is the reference
-    own[0] = np.where(reference[:, None, None], 0.0, np.nan)
-    influence[:, 0] = np.where(reference[:, None], 0.0, np.nan)
-    reason = found.reason[rows]
-    reason[0, reference] = ""
-    if settings.moved == "exclude":
-        excluded = check.wrong[rows]
-        values[excluded], own[excluded], influence[:, excluded] = np.nan, np.nan, np.nan
-        reason[excluded] = MOVED
-    notes = [*_notes(reason, position, rig), *_strain_notes(settings), *check.notes, *corrected]
-    notes += found.notes
-    if settings.strain == "free":
-        notes += _pitch_note(own)
-    for note in notes:
-        log.warning(note)
-    curve = curves(axis, found, rig, position, time[1:], warm, check.wrong)
-    extras, labels = _extras(found, axis, rig, rows, cold, reason, own, curve | check.extras())
-    rig_share = influence[: len(SOURCES)]  # `own` contains the noise of the cold scans already
-    total = own + np.einsum("stki,stkj->tkij", rig_share, rig_share)
-    ds = build_errors(
-        values,
-        total,
-        dims=("time", "position"),
-        coords={"time": time, "y": ("position", position, _METRES)} | labels,
-        component="Y",
-        machine=str(raw.attrs.get("machine", "unknown")),
-        frame="carriage, machine directions",
-        functional_point=np.zeros(3),
-        reference="cold scans of the artefacts, before the warm-up",
-        method=method,
-        method_version=version,
-        measured=raw.attrs,
-        provenance=origin,
-        influence=influence,
-        sources=axis.sources,
-        source_groups=axis.source_groups,
-        extras=extras,
-        start=warm_up_start(raw, found.time, cold),
-        source_ids=pose_identities(rig.pose, rig.pose_covariance),
-        reference_sources=axis.sources[len(SOURCES) :],
-        reference_interval=(0.0, 0.0),
-    )
-    origin_at = settings.carriage_origin
-    frame = {} if origin_at is None else {"frame_origin": np.array(origin_at)}
-    return ds.assign_attrs(notes=notes or [""], registration=settings.registration, strain=settings.strain, **frame)
 
 
 def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None) -> Array:
@@ -223,23 +296,24 @@ def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
 
 
 def _strain_notes(settings: Settings) -> list[str]:
-    """Return notes on scale and expansion that are assumed, or not contained in the uncertainty."""
+    """Return notes on scales, expansions and height that are assumed."""
     stated = {
-        "the scales of the profiler": settings.scale_uncertainty,
-        "the expansion of the artefacts": settings.expansion_uncertainty,
+        "scale_uncertainty": settings.scale_uncertainty,
+        "expansion_uncertainty": settings.expansion_uncertainty,
+        "mount_expansion_uncertainty": settings.mount_expansion_uncertainty,
     }
-    names = " and ".join(name for name, value in stated.items() if value is None)
-    if settings.registration != "height_map":
-        return [
-            "The uncertainty does not contain scale and expansion between cold and warm, which this registration does "
-            "not estimate: 20 um/m of each are usual."
-        ]
-    if not names:
-        return []
-    return [
-        f"No uncertainty is stated of {names} between cold and warm (scale_uncertainty, expansion_uncertainty): "
-        f"{STRAIN * 1e6:g} um/m is assumed, the standard uncertainty."
-    ]
+    notes = []
+    if names := [name for name, value in stated.items() if value is None]:
+        notes.append(
+            f"Not stated, and assumed to be {STRAIN * 1e6:g} um/m between cold and warm (standard uncertainty): "
+            f"{', '.join(names)}."
+        )
+    if settings.artefact_height is None and settings.strains()["expansion"] > 0:
+        notes.append(
+            f"Not stated, and assumed to be {HEIGHT * 1e3:g} mm: the height of the artefacts (artefact_height), by "
+            "which their expansion displaces the surfaces."
+        )
+    return notes
 
 
 def _notes(reason: NDArray[np.object_], position: Array, rig: Rig) -> list[str]:
@@ -258,9 +332,13 @@ def _notes(reason: NDArray[np.object_], position: Array, rig: Rig) -> list[str]:
     return notes
 
 
-def _pitch_note(own: Array) -> list[str]:
+def _sigma(covariance: Array) -> Array:
+    return np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+
+
+def _pitch_note(covariance: Array) -> list[str]:
     """Return a note if the pitch, determined by the relief alone, dominates the uncertainty of EYY over the lever."""
-    u = np.sqrt(np.nanmedian(np.diagonal(own[1:], axis1=-2, axis2=-1), axis=(0, 1)))
+    u = np.sqrt(np.nanmedian(np.diagonal(covariance[1:], axis1=-2, axis2=-1), axis=(0, 1)))
     if not u[1] > DOMINANCE * u[[0, 2]].max():
         return []
     return [
@@ -268,51 +346,6 @@ def _pitch_note(own: Array) -> list[str]:
         "by the relief of the artefacts alone and acts over the lever. Both are correlated: state the errors at the "
         "tool (ds.em.at). Where the carriage follows its guide, strain = 'guided' gives smaller uncertainties."
     ]
-
-
-def _extras(
-    found: Registrations,
-    axis: Carriage,
-    rig: Rig,
-    rows: list[int],
-    cold: list[int],
-    reason: NDArray[np.object_],
-    own: Array,
-    further: dict[str, Any],
-) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
-    """Return the extra results without coordinates, and their coordinates."""
-    two = ("time", "position")
-    quality = {name: values[rows] for name, values in found.quality.items()}
-    deviation = np.sqrt(np.diagonal(own, axis1=-2, axis2=-1))
-    predicted = np.broadcast_to(np.sqrt(np.diagonal(axis.predicted, axis1=-2, axis2=-1)), deviation.shape)
-    jitter = np.stack([quality["jitter_z"], quality["jitter_y"]], axis=-1)
-    out: dict[str, Any] = {
-        "reason": (two, reason.astype(str)),
-        "scan_time": (two, found.time[rows], {"units": "s"}),
-        "registration_u": ((*two, "dof"), deviation),
-        "predicted_u": ((*two, "dof"), predicted),
-        "residual_rms": (two, quality["residual_rms"], _METRES),
-        "points_used": (two, quality["points_used"].astype(np.int64)),
-        "noise_found": (two, quality["noise_found"], _METRES),
-        "line_jitter": ((*two, "jitter"), jitter, _METRES),
-        "condition": (two, quality["condition"]),
-        "strain": ((*two, "direction"), axis.drift[rows]),
-        "profiler_pose": (("row", "column"), rig.pose.as_matrix()),
-        "lever": ("direction", rig.lever, _METRES),
-    }
-    if rig.pose_covariance is not None:
-        out["pose_u"] = ("pose_parameter", np.sqrt(np.diag(rig.pose_covariance)))
-    repeats = [c for c in cold[1:] if np.isfinite(axis.values[c]).any()]
-    if repeats:
-        out["cold_repeat"] = (("repeat", "position", "dof"), axis.values[repeats])
-        u = np.sqrt(np.diagonal(axis.covariance[repeats], axis1=-2, axis2=-1))
-        out["cold_repeat_u"] = (("repeat", "position", "dof"), u)
-    out |= _map_extras(found.maps, rows) | further
-    coords: dict[str, Any] = {name: out.pop(name) for name in ("place", "moment")}
-    coords |= {"jitter": ["z", "y"], "direction": list("xyz")}
-    if "pose_u" in out:
-        coords["pose_parameter"] = ["a", "b", "g", "dx", "dy", "dz"]
-    return {name: xr.DataArray(xr.Variable(*parts)) for name, parts in out.items()}, coords
 
 
 def _map_extras(maps: list[Maps | None], rows: list[int]) -> dict[str, Any]:

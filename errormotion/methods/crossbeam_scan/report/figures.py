@@ -25,8 +25,17 @@ def _largest(errors: xr.Dataset) -> list[FigureOfMerit]:
         at, largest = seen.largest(i), seen.extreme(i)
         if at is not None and largest is not None:
             name = f"largest {seen.names[freedom]} at {seen.where(*at)}".replace("\u00a0", " ")
-            found.append(FigureOfMerit(name, largest.value, largest.expanded, _unit(i)))
+            effects = _effects(errors, freedom, at)
+            found.append(FigureOfMerit(name, largest.value, largest.expanded, _unit(i), influence=effects))
     return found
+
+
+def _effects(errors: xr.Dataset, freedom: str, at: tuple[int, int]) -> dict[str, float] | None:
+    """Return the effect of each source on an error at (cycle, artefact)."""
+    if "influence" not in errors:
+        return None
+    there = errors["influence"].isel(time=at[0], position=at[1]).sel(dof=freedom)
+    return {str(name): float(F) for name, F in zip(errors["source"].values, there.values, strict=True)}
 
 
 def _of_pose(errors: xr.Dataset) -> list[FigureOfMerit]:

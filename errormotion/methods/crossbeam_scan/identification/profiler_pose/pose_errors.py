@@ -12,10 +12,16 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
+from errormotion.plugins import Redraw, Redrawing
 
 if TYPE_CHECKING:
+    from numpy.random import Generator
+
+    from errormotion.arrays import Array
     from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
 
+RADIUS_UNCERTAINTY = 1e-6
+"""Standard uncertainty of the radius of a pocket, m, where the data state none."""
 NOMINAL_STEP = 0.01
 """Without a stated nominal pose, the nominal position is the one found, rounded to this, m; its angles are 0."""
 
@@ -95,3 +101,35 @@ def _sensitivity(p: np.ndarray, nominal: RigidTransform) -> np.ndarray:
     steps = 1e-6 * np.eye(6)
     up, down = (_deviation(calibration.pose(*ends.T), nominal) for ends in (p + steps, p - steps))
     return np.asarray((up - down) / 2e-6)
+
+
+def redrawing(raw: xr.Dataset, settings: Settings) -> Redrawing:
+    """Return the scans of a pocket with their sources for the Monte Carlo method: lines, radius and centre.
+
+    The scans state no noise. Their lines are drawn with replacement, which reproduces their scatter.
+    """
+    radius = float(raw["pocket_radius_uncertainty"]) if "pocket_radius_uncertainty" in raw else RADIUS_UNCERTAINTY
+    sources = {"lines": Redraw(_lines, own=True), "radius of the pocket": _shift("pocket_radius", radius)}
+    if "pocket_centre_uncertainty" in raw:
+        centre = np.asarray(raw["pocket_centre_uncertainty"].values, dtype=float)
+        sources["centre of the pocket"] = _shift("pocket_centre", centre)
+    return Redrawing(raw.load(), settings, sources)
+
+
+def _lines(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+    """Return every scan with the same number of its lines, drawn with replacement."""
+    scans = []
+    for number in range(raw.sizes["scan"]):
+        drawn = np.sort(generator.integers(0, raw.sizes["profile"], raw.sizes["profile"]))
+        scans.append(raw[["height", "stage"]].isel(scan=number, profile=drawn))
+    chosen = xr.concat(scans, "scan")
+    return raw.assign({name: chosen[name].transpose(*raw[name].dims) for name in ("height", "stage")}), settings
+
+
+def _shift(name: str, uncertainty: Array | float) -> Redraw:
+    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+        value = raw[name]
+        change = uncertainty * generator.normal(size=value.shape)
+        return raw.assign({name: value.copy(data=value.values + change)}), settings
+
+    return Redraw(draw, own=True)

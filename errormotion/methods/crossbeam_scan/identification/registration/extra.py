@@ -99,11 +99,16 @@ class Extra:
         total: Array = np.eye(3) + np.tensordot(values, self.bases, 1)
         return total
 
-    def moved(self, covariance: Array, shift: Array) -> Array:
-        """Return the covariance of twist and parameters (6 + k, 6 + k) about a point that is ``shift`` (3,) further."""
+    def about(self, shift: Array) -> Array:
+        """Return what takes twist and parameters to a point that is ``shift`` (3,) further, (6 + k, 6 + k)."""
         A = np.eye(6 + len(self.names))
         A[:6, :6] = adjoint(shift=shift)
         A[:3, 6:] = (self.bases @ shift).T
+        return A
+
+    def moved(self, covariance: Array, shift: Array) -> Array:
+        """Return the covariance of twist and parameters (6 + k, 6 + k) about a point that is ``shift`` (3,) further."""
+        A = self.about(shift)
         moved = known_product(A, known_product(A, covariance).T)
         return 0.5 * (moved + moved.T)
 

@@ -1,4 +1,4 @@
-"""Detection of artefacts that moved between two scans, or were not scanned at their position.
+"""Artefacts that moved between two scans, or were not scanned at their position.
 
 A repeated cold scan must show no motion. The errors of an axis are smooth over position, so that those at one artefact
 can be predicted from the others: an artefact that moved adds the same step to all its later scans, but its neighbours
@@ -7,12 +7,17 @@ do not show it.
 The twists are expected as registered: in the profiler's frame, at its origin. At the carriage, behind a lever of 2 m,
 the noise of the rotations dominates that of the displacements, and all of them are correlated. A step is the effect of
 the motion of the artefact on the errors: the artefact itself moved by the opposite.
+
+The rule of `errormotion.estimation.checks` tests residuals of a fit. Here there are none: six readings determine the
+six unknowns of a scan, and the smoothness that contradicts them is itself estimated from few artefacts. The F
+distribution of its test has the degrees of freedom of the smooth curve, which the rule does not know.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,14 +26,109 @@ from scipy import special
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.estimation.smoothing import ORDER, smooth
+from errormotion.methods.crossbeam_scan.identification.model import Campaign
 
-#: Smallest number of artefacts that can be compared with each other.
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
 MINIMUM_ARTEFACTS = 4
-#: Order of the curves that predict an artefact from the others. Seven artefacts in one cycle do not determine the
-#: roughness of a guide; with order 3, a guide whose curvature changes abruptly would nearly always raise an alarm.
+"""Smallest number of artefacts that can be compared with each other."""
 PREDICTION_ORDER = 2
-#: Probability of any false alarm in a campaign.
+"""Order of the curves that predict an artefact from the others. Seven artefacts in one cycle do not determine the
+roughness of a guide; with order 3, a guide whose curvature changes abruptly would nearly always raise an alarm."""
 FALSE_ALARM = 0.01
+"""Probability of any false alarm in a campaign."""
+MOVED = "the artefact had moved"
+"""Reason stated for errors that are excluded because their artefact moved."""
+
+
+@dataclass(frozen=True)
+class ArtefactCheck:
+    """Errors that are caused by the motion of an artefact.
+
+    Attributes
+    ----------
+    wrong : ndarray of bool, (cycle, artefact)
+        Scans of artefacts after they had moved.
+    since : ndarray, (artefact,)
+        Time of the first scan after an artefact moved, s; NaN where it did not.
+    notes, doubts : list of str
+        Messages for the user; the latter doubt the uncertainties.
+    """
+
+    wrong: NDArray[np.bool_]
+    since: Array
+    notes: list[str]
+    doubts: list[str]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the extra variables of the error dataset."""
+        return {"moved": ("position", np.isfinite(self.since)), "moved_since": ("position", self.since, {"units": "s"})}
+
+
+def check_artefacts(
+    every: Campaign, settings: Settings, time: Array, cold: list[int], warm: list[int]
+) -> ArtefactCheck:
+    """Return which artefacts moved, from the repeated cold scans and from a comparison with their neighbours.
+
+    Parameters
+    ----------
+    every : Campaign
+        Of all cycles.
+    settings : Settings
+    time : (warm cycle,)
+        s, increasing.
+    cold, warm : list of int
+        Cycles; those of ``cold`` after the first are repeats of it.
+    """
+    twist, covariance, by_cold = every.profiler()
+    positions = every.positions
+    repeatability = (settings.repeatability_shift, settings.repeatability_turn)
+    wrong, since = np.zeros(twist.shape[:2], dtype=bool), np.full(positions.size, np.nan)
+    repeats = cold[1:]
+    notes = _cold_notes(twist[repeats], covariance[repeats], positions, repeatability)
+    consistency = moved_artefacts(
+        time, positions, twist[warm], covariance[warm], repeatability=repeatability, cold_covariance=by_cold[warm]
+    )
+    if not consistency.tested:
+        notes.append("Too few artefacts to detect one that moved: at least four are needed.")
+    for one in consistency.moved:
+        wrong[warm[one.since :], one.artefact] = True
+        since[one.artefact] = time[one.since]
+    excluded = settings.moved == "exclude"
+    moved = _moved_notes(consistency, positions, time, excluded)
+    return ArtefactCheck(wrong, since, notes + moved * excluded, moved * (not excluded))
+
+
+def _cold_notes(twist: Array, covariance: Array, positions: Array, repeatability: tuple[float, float]) -> list[str]:
+    if not len(twist):
+        return []
+    notes = []
+    for repeat, k in np.argwhere(cold_repeats(twist, covariance, repeatability=repeatability).suspicious):
+        shift, turn = _size(twist[repeat, k])
+        notes.append(
+            f"The artefact at {positions[k]:g} m has moved between the cold scan and its repetition "
+            f"({shift:.1f} um, {turn:.1f} urad). Check its clamping and the thermal equilibrium of the machine."
+        )
+    return notes
+
+
+def _moved_notes(found: Consistency, positions: Array, time: Array, excluded: bool) -> list[str]:
+    notes = []
+    for one in found.moved:
+        shift, turn = _size(one.step)
+        notes.append(
+            f"The artefact at {positions[one.artefact]:g} m moved before the scan at {time[one.since] / 60:.1f} min, "
+            f"by {shift:.1f} um and {turn:.1f} urad relative to the others; its later errors are "
+            + ("excluded." if excluded else "kept, but not reliable.")
+        )
+    return notes
+
+
+def _size(twist: Array) -> tuple[float, float]:
+    """Return the lengths of displacement and rotation, um and urad."""
+    shift, turn = np.linalg.norm(np.nan_to_num(twist).reshape(2, 3), axis=1) * 1e6
+    return float(shift), float(turn)
 
 
 @dataclass(frozen=True)
@@ -147,7 +247,7 @@ def moved_artefacts(
     covariance: ArrayLike,
     *,
     repeatability: Sequence[float] = (0.0, 0.0),
-    cold_share: ArrayLike = 0.0,
+    cold_covariance: ArrayLike = 0.0,
     false_alarm: float = FALSE_ALARM,
 ) -> Consistency:
     """Return the artefacts that moved between two scans, and when.
@@ -167,9 +267,9 @@ def moved_artefacts(
         Twists relative to the cold scans, m and rad, preferably in the profiler's frame; a scan with NaN is not used.
     repeatability : (float, float)
         Standard deviation of the repeatability of the machine from scan to scan in each freedom, m and rad.
-    cold_share : float or (t, n)
-        Share of the covariance that is caused by the cold scan, one draw for all cycles of an artefact. Without it, the
-        test is less sensitive, but valid.
+    cold_covariance : (t, n, 6, 6), optional
+        What of the covariance is caused by the cold scan, one draw for all cycles of an artefact. Without it, the test
+        is less sensitive, but valid.
     false_alarm : float
         Probability of one or more false alarms over all artefacts and cycles.
 
@@ -191,10 +291,10 @@ def moved_artefacts(
             f"Expected increasing times ({E.shape[0]},) and positions ({E.shape[1]},) for errors of shape {E.shape}; "
             f"found {t.shape} and {y.shape}."
         )
-    share = np.broadcast_to(np.asarray(cold_share, dtype=float), E.shape[:2])[..., None, None]
+    cold = np.broadcast_to(np.asarray(cold_covariance, dtype=float), C.shape)
     known = np.asarray(np.isfinite(E).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1)), dtype=bool)
     machine = np.diag(_spread(repeatability) ** 2)
-    scans = _Scans(y, E, (1 - share) * C + machine, _mean(share * C, known) + machine, known)
+    scans = _Scans(y, E, C - cold + machine, _mean(cold, known) + machine, known)
     used = np.flatnonzero(known.any(axis=0))
     tests = int(known[:, used].sum())
     if used.size < MINIMUM_ARTEFACTS or not tests:
