@@ -196,11 +196,11 @@ def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
             f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) after registration; "
             "check that both scans are of the same artefact, start at the same position and have the same units"
         )
-    M = start.state.matrix
-    shift, turn = M[:, :3] @ cold.centre + M[:, 3] - cold.centre, start.state.turn
-    if np.hypot(*shift[:2]) > MAX_SHIFT or turn > MAX_TURN:
+    pose = start.state.pose
+    shift, turn = np.hypot(*(pose.apply(cold.centre) - cold.centre)[:2]), start.state.turn
+    if shift > MAX_SHIFT or turn > MAX_TURN:
         raise MethodError(
-            f"expected a motion of at most 2 mm and 0.05 rad, found {np.hypot(*shift[:2]) * 1e3:.2f} mm across and "
+            f"expected a motion of at most 2 mm and 0.05 rad, found {shift * 1e3:.2f} mm across and "
             f"{turn:.3f} rad; start both scans at the same position of the artefact"
         )
     if start.overlap < MIN_OVERLAP:

@@ -18,12 +18,11 @@ Variances of the effects by expectation and maximisation: tau^2 = mean(effect^2 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from errormotion.arrays import Array
 from errormotion.estimation.robust import NORMAL_MAD
@@ -108,7 +107,7 @@ class Problem:
 
     def stepped(self, state: State, step: Array) -> State:
         """Return the state after a further twist at the centre and extra values, (6 + k,), or after a twist (6,)."""
-        turn = rotation(step[3:6])
+        turn = Rotation.from_rotvec(step[3:6]).as_matrix()
         matrix = turn @ state.matrix
         matrix[:, 3] += step[:3] + self.centre - turn @ self.centre
         return State(matrix, state.values + step[6:] if len(step) > 6 else state.values)
@@ -144,18 +143,7 @@ class State:
     @property
     def turn(self) -> float:
         """Angle of the rotation, rad."""
-        R = self.matrix[:, :3]
-        axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        return float(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1.0))
-
-
-def rotation(v: Array) -> Array:
-    """Return the matrix (3, 3) of a rotation vector (3,), rad, after Rodrigues."""
-    angle = math.sqrt(v @ v)
-    K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-    sinc, half = (math.sin(a) / a if a > 0.0 else 1.0 for a in (angle, 0.5 * angle))
-    R: Array = np.eye(3) + sinc * K + 0.5 * half * half * (K @ K)
-    return R
+        return float(self.pose.rotation.magnitude())
 
 
 @dataclass(frozen=True)
