@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.tables.numbers import NUMBER
 from errormotion.datasets.tables.reading import read_table as read_file
 from errormotion.datasets.tables.table import Place, Table
-from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue
+from errormotion.datasets.text.layout import passes, tall
+from errormotion.datasets.text.log_map import LogMap, MappedColumn, MappedValue, base_key
 from errormotion.datasets.text.log_reader import NOTES, clock_notes, holes, places_of, spread
 from errormotion.datasets.text.table_reader import (
     FREEDOM,
@@ -51,11 +53,16 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     settings = load_model(map_file, LogMap)
     map_mistakes = Mistakes(map_file)
     names = Names.of(_tables(settings, map_mistakes), _free_labels(settings))
-    columns = {key: _column(key, entry, names, map_mistakes) for key, entry in settings.columns.items()}
+    checked = {where: _column(where, entry, names, map_mistakes) for where, entry in settings.columns.items()}
+    columns = {base_key(where): column for where, column in checked.items()}
     dims = {dim for row in names.rows.values() for dim in names.record_dims(row)}
-    for dim in settings.labels:
+    stated = {f"labels.{dim}": dim for dim in settings.labels}
+    stated |= {f"columns.{key}.labels.{dim}": dim for key, each in settings.columns.items() for dim in each.labels}
+    for where, dim in stated.items():
         if dim not in dims:
-            map_mistakes.add(0, f"labels.{dim}: unknown dimension; {nearest(dim, dims)}")
+            map_mistakes.add(0, f"{where}: unknown dimension; {nearest(dim, dims)}")
+    if settings.sequence is not None and not {"run", "approach", "target"} <= dims:
+        map_mistakes.add(0, "sequence: expected a schema with run, approach and target; found none of them")
     map_mistakes.raise_any()
     table, found = read_file(log, settings.format), Found()
     for name, value in settings.values.items():
@@ -63,16 +70,16 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     map_mistakes.raise_any()
     known = {key: column for key, column in columns.items() if column is not None}
     mistakes = Mistakes(log)
-    cells, start, notes = _cells(table, settings, mistakes)
-    for part, columns_of_part, keys in _parts(cells, known, settings, names, mistakes):
+    read = _columns(table, settings, mistakes)
+    for part, columns_of_part, keys in _parts(read, known, settings, names, mistakes):
         for text in incomplete(columns_of_part, keys, names):
             mistakes.add(0, text)
         if not mistakes.count:
             read_table(part, columns_of_part, keys, names, found, mistakes)
     mistakes.raise_any()
-    notes += _missing_rows(cells, list(settings.labels))
-    stated = {"machine": settings.machine, "start": start, NOTES: json.dumps(notes) if notes else ""}
-    attrs = {**settings.attributes, **{name: text for name, text in stated.items() if text}}
+    notes = read.notes + _missing_rows(read.cells, read.keys)
+    known_attrs = {"machine": settings.machine, "start": read.start, NOTES: json.dumps(notes) if notes else ""}
+    attrs = {**settings.attributes, **{name: text for name, text in known_attrs.items() if text}}
     return found.dataset({"schema": settings.schema_, **attrs}, names)
 
 
@@ -93,7 +100,7 @@ def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
     fixed = {dim for table in tables for dim in table.labels}
     found: dict[str, tuple[str, ...]] = {}
     for key in settings.columns:
-        name, dot, label = key.partition(".")
+        name, dot, label = base_key(key).partition(".")
         if dot and name in rows_of and rows_of[name].dims and not fixed & set(rows_of[name].dims):
             dim = rows_of[name].dims[-1]
             found[dim] = (*(each for each in found.get(dim, ()) if each != label), label)
@@ -102,7 +109,7 @@ def _free_labels(settings: LogMap) -> dict[str, tuple[str, ...]]:
 
 def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> Column | None:
     """Return a column of the map with its variable; None and a mistake if there is no such variable."""
-    name, dot, label = key.partition(".")
+    name, dot, label = base_key(key).partition(".")
     row = names.rows.get(name)
     if row is None:
         mistakes.add(0, f"columns.{key}: unknown variable; {nearest(name, names.rows)}")
@@ -195,70 +202,109 @@ def _header_text(table: Table, key: str) -> str | None:
     return None
 
 
-def _cells(table: Table, settings: LogMap, mistakes: Mistakes) -> tuple[Cells, str, list[str]]:
+@dataclass(frozen=True)
+class _Columns:
+    """What is read of a table: cells, numbers of the columns with labels, and those of each key of the map."""
+
+    cells: Cells
+    keys: dict[str, int]
+    columns: dict[str, list[int]]
+    start: str
+    notes: list[str]
+
+
+def _columns(table: Table, settings: LogMap, mistakes: Mistakes) -> _Columns:
     """Return the required columns of a table with numbers and labels, its first date, and notes."""
-    wanted: dict[str, Place] = {f"labels.{dim}": column for dim, column in settings.labels.items()}
+    wanted: dict[str, Place] = {f"labels.{dim}": entry.column for dim, entry in settings.labels.items()}
+    if settings.sequence is not None:
+        wanted["sequence"] = settings.sequence
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
     places = places_of(table, wanted, mistakes)
-    names = {key: f"column '{table.titles[where[0]]}'" for key, where in places.items()}
+    titles = {key: f"column '{table.titles[where[0]]}'" for key, where in places.items()}
     dated = {f"columns.{key}": entry.unit for key, entry in settings.columns.items() if is_date(entry.unit)}
-    numeric = {where[0]: names[key] for key, where in places.items() if key.startswith("columns") and key not in dated}
-    values = table.numbers(numeric, mistakes)
+    cells = [where for where in places if not where.startswith("labels") and where not in dated]
+    values = table.numbers({places[where][0]: titles[where] for where in cells}, mistakes)
     clocks: dict[str, Clock] = {}
-    rest: list[str] = []
+    notes = list(table.notes)
     numbers: dict[int, Array] = {}
-    for k, (key, where) in enumerate(places.items()):
-        if key in dated:
-            numbers[k], clocks[key] = table.seconds(where, dated[key], names[key], mistakes, repeats=True)
-            if key == "columns.time" and not settings.labels:
+    texts: dict[int, Sequence[str]] = {}
+    keys: dict[str, int] = {}
+    columns: dict[str, list[int]] = {}
+    for k, (where, place) in enumerate(places.items()):
+        if where.startswith("labels"):
+            dim = where.partition(".")[2]
+            keys[dim], names = k, settings.labels[dim].names
+            texts[k] = [names.get(text, text) for text in table.texts(place)]
+            continue
+        if where in dated:
+            numbers[k], clocks[where] = table.seconds(place, dated[where], titles[where], mistakes, repeats=True)
+            if where == "columns.time" and not settings.labels:
                 numbers[k], equal = spread(numbers[k])
-                rest += equal
-        elif where[0] in values:
-            numbers[k] = values[where[0]]
-    texts = {k: table.texts(where) for k, (key, where) in enumerate(places.items()) if key.startswith("labels")}
-    start = next((clock.start.isoformat() for clock in clocks.values() if clock.start), "")
-    notes = [*table.notes, *(note for clock in clocks.values() for note in clock_notes(clock)), *rest]
-    time = next((k for k, key in enumerate(places) if key == "columns.time"), None)
-    if time is not None and not mistakes.count:
-        unit = "s" if "columns.time" in clocks else settings.columns["time"].unit
-        notes += holes(np.asarray(convert(numbers[time], unit, "s"), dtype=float), table.lines)
+                notes += equal
+        else:
+            numbers[k] = values[place[0]]
+        if where.startswith("columns"):
+            columns.setdefault(base_key(where.partition(".")[2]), []).append(k)
     heads = [table.titles[where[0]] for where in places.values()]
-    return Cells((table.head, heads), table.lines, texts, numbers), start, notes
+    if settings.sequence is not None and not mistakes.count:
+        positions = numbers[list(places).index("sequence")]
+        for dim, found in zip(("run", "approach", "target"), passes(positions, table.lines, mistakes), strict=True):
+            keys[dim] = len(heads)
+            texts[len(heads)] = found
+            heads.append(dim)
+    start = next((clock.start.isoformat() for clock in clocks.values() if clock.start), "")
+    notes += [note for clock in clocks.values() for note in clock_notes(clock)]
+    if "time" in columns and not mistakes.count:
+        unit = "s" if "columns.time" in clocks else settings.columns["time"].unit
+        notes += holes(np.asarray(convert(numbers[columns["time"][0]], unit, "s"), dtype=float), table.lines)
+    return _Columns(Cells((table.head, heads), table.lines, texts, numbers), keys, columns, start, notes)
 
 
-def _missing_rows(table: Cells, dims: list[str]) -> list[str]:
+def _missing_rows(table: Cells, keys: Mapping[str, int]) -> list[str]:
     """Return the note on combinations of labels for which the log has no row."""
-    labels = [list(dict.fromkeys(table.texts[k])) for k in range(len(dims))]
-    there = set(zip(*(table.texts[k] for k in range(len(dims))), strict=True))
-    lacking = math.prod(map(len, labels)) - len(there) if dims else 0
+    texts = [table.texts[number] for number in keys.values()]
+    labels = [list(dict.fromkeys(column)) for column in texts]
+    there = set(zip(*texts, strict=True))
+    lacking = math.prod(map(len, labels)) - len(there) if keys else 0
     if not lacking:
         return []
     first = next(each for each in itertools.product(*labels) if each not in there)
-    where = ", ".join(f"{dim} '{label}'" for dim, label in zip(dims, first, strict=True))
+    where = ", ".join(f"{dim} '{label}'" for dim, label in zip(keys, first, strict=True))
     number = "1 combination" if lacking == 1 else f"{lacking} combinations"
     return [f"no row for {number} of the labels, whose values are NaN; the first is {where}"]
 
 
 def _parts(
-    table: Cells, columns: Mapping[str, Column], settings: LogMap, names: Names, mistakes: Mistakes
+    read: _Columns, columns: Mapping[str, Column], settings: LogMap, names: Names, mistakes: Mistakes
 ) -> Iterator[tuple[Cells, dict[int, Column], dict[str, int]]]:
     """Yield the table once for each set of dimensions, with the columns of its variables and the label columns.
 
-    Variables with fewer dimensions than others have repeated values; one line of each is kept.
+    Variables with fewer dimensions than others have repeated values; one line of each is kept. Variables with several
+    columns have a table of their own, with a row for each reading.
     """
-    first = len(settings.labels)
-    keys = {dim: number for number, dim in enumerate(settings.labels)}
+    table, keys = read.cells, read.keys
     groups: dict[tuple[str, ...], dict[int, Column]] = {}
-    for number, key in enumerate(settings.columns, start=first):
+    used: set[str] = set()
+    for key, numbers in read.columns.items():
         record = names.record_dims(columns[key].row)
-        groups.setdefault(record, {})[number] = columns[key]
-    widest = max(groups, key=len)
+        used |= set(record)
+        entries = settings.entries[key]
+        if not entries[0].labels:
+            groups.setdefault(record, {})[numbers[0]] = columns[key]
+            continue
+        labels = [{dim: str(label) for dim, label in entry.labels.items()} for entry in entries]
+        own = {dim: number for dim, number in keys.items() if dim in record}
+        width = len(table.head[1])
+        further = {dim: width + k for k, dim in enumerate(labels[0])}
+        yield tall(table, own, numbers, labels), {width + len(further): columns[key]}, own | further
+    widest = max(groups, key=len, default=())
+    several = len(groups) < len(read.columns) and any(settings.entries[key][0].labels for key in read.columns)
     for record, group in groups.items():
         own = {dim: number for dim, number in keys.items() if dim in record}
-        repeats = record != widest and set(record) <= set(keys) and bool(record)
+        repeats = (record != widest or several) and set(record) <= set(keys) and bool(record)
         part = _without_repetition(table, list(own.values()), list(group), mistakes) if repeats else table
         yield part, group, own
-    for dim in set(keys) - {dim for record in groups for dim in record}:
+    for dim in set(keys) - used:
         mistakes.add(0, f"labels.{dim}: no variable of the map has this dimension")
 
 
