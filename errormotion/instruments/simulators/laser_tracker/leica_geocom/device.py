@@ -9,7 +9,7 @@ from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.laser_tracker.leica_geocom import grammar
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.commands import MODELS, Commands
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.commands import DECIMALS, MODELS, Commands
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import Telescope
 from errormotion.instruments.transports import Address
 
@@ -82,13 +82,9 @@ class SimulatedGeoComStation(SimulatedDevice):
             return grammar.reply(self._code, found.transaction)
         if self.fault.affects("link_error", self._answers):
             return grammar.refusal(self._code, found.transaction)
-        settings = self.commands.settings
-        if not (settings.powered and not settings.asleep) and found.name != "COM_SwitchOnTPS":
-            code = Code.COM_SRVR_IS_SLEEPING if settings.asleep else Code.COM_SRVR_IS_OFF
-            return grammar.refusal(code, found.transaction)
         self.commands.warning = 0
         try:
             values = self.commands.do(found.name, found.values)
         except RefusedError as refused:
             return grammar.reply(refused.code, found.transaction)
-        return grammar.reply(self.commands.warning, found.transaction, grammar.encode(values, settings.decimals))
+        return grammar.reply(self.commands.warning, found.transaction, grammar.encode(values, DECIMALS))

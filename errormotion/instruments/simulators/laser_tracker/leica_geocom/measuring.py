@@ -32,7 +32,6 @@ MAX_WAIT = 60_000
 ACCURACY = 2.4e-6
 """Stated standard deviation of angles and inclinations, rad."""
 WAVELENGTH = 6.58e-7
-EARTH, REFRACTION = 6_378_000.0, 0.13
 
 Numbers = tuple[float, ...]
 
@@ -49,20 +48,13 @@ class Measuring:
     ----------
     warning : int
         Return code of the last call that was executed: 0, or a missing part of its values.
-    prism_constant : float
-        m.
     """
 
     def __init__(self, world: VirtualWorld, telescope: Telescope) -> None:
         self.world, self.telescope = world, telescope
         self.warning = 0
-        self.prism_constant = 0.0
-        self._station = (0.0, 0.0, 0.0, 0.0)
-        self._height = 0.0
         self._air = (WAVELENGTH, 1013.25, 12.0, 8.55)
-        self._refraction: tuple[int, float, float] = (0, EARTH, REFRACTION)
         self._edm = STANDARD
-        self._compensator = 1
         self._ready: float | None = None  # time at which the distance is complete, s; None: none was started
         self._signal = False
         self._distance: float | None = None
@@ -102,7 +94,7 @@ class Measuring:
         if not self._continuous:
             self._ready = None
         self._distance = None
-        self._distance = self.telescope.distance(self.prism_constant, self._ppm())
+        self._distance = self.telescope.distance(self._ppm())
         return self._distance
 
     def _pass(self, seconds: float) -> None:
@@ -126,59 +118,14 @@ class Measuring:
         if failed:
             self.warning = Code.TMC_DIST_ERROR
         elif distance is None:
-            self.warning = Code.TMC_ANGLE_OK if self._compensator else Code.TMC_ANGLE_NO_FULL_CORRECTION
-        elif not self._compensator:
-            self.warning = Code.TMC_NO_FULL_CORRECTION
+            self.warning = Code.TMC_ANGLE_OK
         return (*angles, distance or 0.0)
-
-    def measure_at_once(self, mode: int) -> tuple[float, float, float]:
-        """Measure directions and, depending on the mode of the basic application, a distance."""
-        if mode == 6:
-            self.TMC_DoMeasure(STOP, 1)
-        elif mode == 5:
-            self.TMC_DoMeasure(CLEAR, 1)
-        elif mode >= 2:
-            self.TMC_DoMeasure({2: DEFAULT, 3: TRACK, 4: RAPID}[mode], 1)
-        if mode == 1:
-            return (*self.telescope.direction(), 0.0)
-        found = self._measured(MAX_WAIT, 1)
-        if self.warning == Code.TMC_DIST_ERROR:
-            raise RefusedError(Code.TMC_DIST_ERROR)
-        return found
 
     def TMC_GetSimpleMea(self, wait: int, inclination: int) -> Numbers:
         """Return directions, rad, and the distance, m."""
         return self._measured(wait, inclination)
 
-    def TMC_GetFullMeas(self, wait: int, inclination: int) -> tuple[float | int, ...]:
-        """Return directions, their accuracy, both inclinations, their accuracy, distance and its time, ms."""
-        horizontal, zenith, distance = self._measured(wait, inclination)
-        return horizontal, zenith, ACCURACY, 0.0, 0.0, ACCURACY, distance, self._clock()
-
-    def TMC_QuickDist(self) -> Numbers:
-        """Return directions and a distance that is measured at once, by tracking."""
-        if self._ready is None or not self._continuous:
-            self.TMC_DoMeasure(RAPID, 1)
-        return self._measured(MAX_WAIT, 1)
-
-    def EDM_IsContMeasActive(self, kind: int) -> int:
-        """Whether a continuous measurement is running: of a signal (1), frequency (2), distances (3) or any (4)."""
-        _check(1 <= kind <= 4)
-        distances = self._continuous and self._ready is not None
-        return int({1: self._signal, 2: False, 3: distances, 4: distances or self._signal}[kind])
-
-    def TMC_GetSignal(self) -> tuple[float | int, ...]:
-        """Return the intensity of the signal, %; only in the signal program."""
-        if not self._signal:
-            raise RefusedError(Code.TMC_SIGNAL_ERROR)
-        return 62.0, self._clock()
-
     # ------------------------------------------------------------------ angles
-
-    def TMC_GetAngle5(self, inclination: int) -> Numbers:
-        """Return the directions, rad."""
-        self._incline(inclination)
-        return self.telescope.direction()
 
     def TMC_GetAngle1(self, inclination: int) -> tuple[float | int, ...]:
         """Return directions, accuracy and time (ms), inclinations, accuracy and time, and the face."""
@@ -190,8 +137,6 @@ class Measuring:
         _check(0 <= inclination < INCLINATIONS)
         if self._signal:
             raise RefusedError(Code.TMC_BUSY)
-        if not self._compensator:
-            self.warning = Code.TMC_NO_FULL_CORRECTION
 
     def _clock(self) -> int:
         return round(1000.0 * self.world.time) % 2**31
@@ -199,24 +144,11 @@ class Measuring:
     def TMC_GetFace(self) -> int:
         return self.telescope.face
 
-    def TMC_GetAngSwitch(self) -> tuple[int, ...]:
-        """Return whether the corrections of inclination, standing axis, collimation and tilting axis are on."""
-        return self._compensator, 1, 1, 1
-
-    def TMC_GetInclineSwitch(self) -> int:
-        return self._compensator
-
-    def TMC_SetInclineSwitch(self, on: int) -> None:
-        _check(on in (0, 1))
-        self._compensator = on
-
     # ------------------------------------------------------------------ coordinates
 
     def _coordinates(self, horizontal: float, zenith: float, distance: float) -> tuple[float, float, float]:
-        east, north, height, instrument = self._station
         across = distance * math.sin(zenith)
-        height += instrument + distance * math.cos(zenith) - self._height
-        return east + across * math.sin(horizontal), north + across * math.cos(horizontal), height
+        return across * math.sin(horizontal), across * math.cos(horizontal), distance * math.cos(zenith)
 
     def TMC_GetCoordinate(self, wait: int, inclination: int) -> tuple[float | int, ...]:
         """Return coordinates and their time, ms, of the distance, and of the continuous angles."""
@@ -224,49 +156,11 @@ class Measuring:
         coordinates = self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
         return (*coordinates, self._clock(), *coordinates, self._clock())
 
-    def TMC_GetSimpleCoord(self, wait: int, inclination: int) -> Numbers:
-        """Return the coordinates; all 0 without a distance."""
-        measured = self._measured(wait, inclination)
-        return self._coordinates(*measured) if measured[2] else (0.0, 0.0, 0.0)
-
-    def TMC_GetStation(self) -> Numbers:
-        return self._station
-
-    def TMC_SetStation(self, east: float, north: float, height: float, instrument: float) -> None:
-        """Set the coordinates of the station; there must be no distance."""
-        self._cleared()
-        self._station = east, north, height, instrument
-
-    def TMC_SetOrientation(self, horizontal: float) -> None:
-        """Set the reading of the present direction; there must be no distance."""
-        self._cleared()
-        self.telescope.orientate(horizontal)
-
-    def _cleared(self) -> None:
-        if self._distance is not None or self._ready is not None:
-            raise RefusedError(Code.TMC_BUSY)
-
-    def TMC_GetHeight(self) -> float:
-        return self._height
-
-    def TMC_SetHeight(self, height: float) -> None:
-        self._cleared()
-        self._height = height
-
     # ------------------------------------------------------------------ corrections
-
-    def TMC_GetEdmMode(self) -> int:
-        return self._edm
 
     def TMC_SetEdmMode(self, mode: int) -> None:
         _check(mode in EDM_MODES)
         self._edm = mode
-
-    def TMC_GetPrismCorr(self) -> float:
-        return self.prism_constant
-
-    def TMC_SetPrismCorr(self, constant: float) -> None:
-        self.prism_constant = constant
 
     def TMC_GetAtmCorr(self) -> Numbers:
         return self._air
@@ -278,18 +172,6 @@ class Measuring:
 
     def TMC_GetAtmPpm(self) -> float:
         return self._ppm()
-
-    def TMC_GetSlopeDistCorr(self) -> Numbers:
-        """Return the total correction of distances, 1e-6, and the prism constant, m."""
-        return self._ppm(), self.prism_constant
-
-    def TMC_GetRefractiveCorr(self) -> tuple[float | int, ...]:
-        return self._refraction
-
-    def TMC_SetRefractiveCorr(self, on: int, radius: float, coefficient: float) -> None:
-        """Set the refraction correction; it only affects heights over long distances, and has no effect here."""
-        _check(on in (0, 1) and radius > 0)
-        self._refraction = on, radius, coefficient
 
 
 def _check(valid: bool) -> None:

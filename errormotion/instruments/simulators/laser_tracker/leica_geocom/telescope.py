@@ -63,7 +63,7 @@ class Telescope:
     Attributes
     ----------
     pointing : tuple
-        Horizontal direction, clockwise, without orientation, and zenith angle, rad, in the first face.
+        Horizontal direction, clockwise, and zenith angle, rad, in the first face.
     face : int
         0 or 1.
     locked : bool
@@ -85,7 +85,6 @@ class Telescope:
         self._world, self._rng, self._obstructed = world, rng, obstructed
         self._uses = 0
         self.face = 0
-        self.orientation = 0.0
         self.locked = bool(address.number("locked", 1))
         self.pointing = self._target()[:2]
 
@@ -115,17 +114,12 @@ class Telescope:
         horizontal, zenith = (self.pointing + self._rng.normal(size=2) * self.angle_noise).tolist()
         if self.face:
             horizontal, zenith = horizontal + math.pi, 2.0 * math.pi - zenith
-        return (horizontal + self.orientation) % (2.0 * math.pi), zenith % (2.0 * math.pi)
-
-    def orientate(self, horizontal: float) -> None:
-        """Set the horizontal reading of the present direction, rad."""
-        self.orientation = 0.0
-        self.orientation = horizontal - self.direction()[0]
+        return horizontal % (2.0 * math.pi), zenith % (2.0 * math.pi)
 
     def turn_to(self, horizontal: float, zenith: float) -> None:
         """Turn to circle readings, rad; a lock ends."""
         self.locked = False
-        horizontal, zenith = horizontal - self.orientation, zenith % (2.0 * math.pi)
+        zenith %= 2.0 * math.pi
         self.face = int(zenith > math.pi)
         if self.face:
             horizontal, zenith = horizontal - math.pi, 2.0 * math.pi - zenith
@@ -159,13 +153,11 @@ class Telescope:
 
     # ------------------------------------------------------------------ distance
 
-    def distance(self, correction: float, ppm: float) -> float:
+    def distance(self, ppm: float) -> float:
         """Return one distance.
 
         Parameters
         ----------
-        correction : float
-            Prism constant that is set, m.
         ppm : float
             Atmospheric correction that is set, 1e-6.
 
@@ -179,4 +171,4 @@ class Telescope:
         temperature, pressure, humidity = self.scene.air(self._world.time)
         raw = self._target()[2] * (1.0 - 1e-6 * _ppm(pressure / 100.0, temperature, humidity))
         raw += self.dead_path - self.prism + self.noise * float(self._rng.normal())
-        return raw * (1.0 + 1e-6 * ppm) + correction
+        return raw * (1.0 + 1e-6 * ppm)
