@@ -78,7 +78,6 @@ def test_a_measurement_starts_from_the_idle_mode_only() -> None:
         assert ask(call(SYSTEM + "startOpticsAlignment"))["result"][0] != 0
         assert ask(call(SYSTEM + "stopMeasurement"))["result"] == [0]
         assert ask(call(SYSTEM + "startOpticsAlignment"))["result"] == [0]
-        assert ask(call("com.attocube.ids.adjustment.getContrastInPermille", 0))["result"] == [0, 840, 0, 0]
 
 
 def test_a_reset_moves_the_reference_and_keeps_the_absolute_position() -> None:

@@ -114,7 +114,7 @@ class SimulatedIds(SimulatedDevice):
     def _set_up(self, address: Address) -> None:
         self._noise, self._init = address.number("noise", 2e-10), address.number("init", 0.02)
         self._contrast, self._passes = int(address.number("contrast", 840)), int(address.number("passes", 1)) - 1
-        self._unit, self._unit_on = bool(address.number("ecu", 1)), True
+        self._unit = bool(address.number("ecu", 1))
         self._old, self._code = address.number("api", 2) < 2, int(address.number("code", BAD_VALUE))
         self._families = tuple(address.params.get("functions", ",".join(FAMILIES)).split(","))
         if not set(self._families) <= set(FAMILIES):
@@ -251,12 +251,6 @@ class SimulatedIds(SimulatedDevice):
     def _system_getDeviceType(self) -> Sequence[Any]:
         return ("IDS3010",)
 
-    def _system_getFpgaVersion(self) -> Sequence[Any]:
-        return ("2.8.0",)
-
-    def _system_getInitMode(self) -> Sequence[Any]:
-        return (self._quick,)
-
     def _system_setInitMode(self, mode: int) -> Sequence[Any]:
         if mode not in (0, 1):
             raise RefusedError(BAD_VALUE)
@@ -328,28 +322,6 @@ class SimulatedIds(SimulatedDevice):
         values = [a + b for a, b in zip(self._counts(), self._references(), strict=True)]
         return self._warned(values, self._beams)
 
-    def _displacement_getAbsolutePosition(self, axis: int) -> Sequence[Any]:
-        beam = self._of(axis)
-        return self._warned([self._counts()[axis] + self._references()[axis]], [beam])
-
-    def _displacement_getReferencePositions(self) -> Sequence[Any]:
-        return self._references()
-
-    def _displacement_getReferencePosition(self, axis: int) -> Sequence[Any]:
-        self._of(axis)
-        return [self._references()[axis]]
-
-    def _displacement_getAxisSignalQuality(self, axis: int) -> Sequence[Any]:
-        beam = self._of(axis)
-        self._measuring()
-        return (0 if beam.broken else self._contrast, 0)
-
-    def _displacement_getSignalQuality(self, axis: int) -> Sequence[Any]:
-        return self._displacement_getAxisSignalQuality(axis)
-
-    def _displacement_getMeasurementEnabled(self) -> Sequence[Any]:
-        return (self._mode() == RUNNING,)
-
     def _displacement_getAverageN(self) -> Sequence[Any]:
         return (self._average,)
 
@@ -364,34 +336,14 @@ class SimulatedIds(SimulatedDevice):
     def _axis_getPassMode(self) -> Sequence[Any]:
         return (self._passes,)
 
-    def _axis_getMasterAxis(self) -> Sequence[Any]:
-        return (0,)
-
-    def _adjustment_getAdjustmentEnabled(self) -> Sequence[Any]:
-        return (self._mode() == ALIGNING,)
-
-    def _adjustment_getContrastInPermille(self, axis: int) -> Sequence[Any]:
-        self._of(axis)
-        if self._mode() != ALIGNING:
-            raise RefusedError(NOT_IN_THIS_MODE, 0, 0, 0)
-        return (self._contrast, 0, 0)
-
-    def _ecu_enable(self) -> Sequence[Any]:
-        self._unit_on = True
-        return ()
-
-    def _ecu_disable(self) -> Sequence[Any]:
-        self._unit_on = False
-        return ()
-
     def _ecu_getEnabled(self) -> Sequence[Any]:
-        return (self._unit_on,)
+        return (True,)
 
     def _ecu_getConnected(self) -> Sequence[Any]:
-        return (self._unit and self._unit_on,)
+        return (self._unit,)
 
     def _air(self) -> tuple[float, float, float]:
-        if not (self._unit and self._unit_on):
+        if not self._unit:
             raise RefusedError(NO_UNIT, 0.0)
         return self._beams[0].scene.air()
 
@@ -410,21 +362,13 @@ class SimulatedIds(SimulatedDevice):
     def _ecu_getRefractiveIndexForCompensation(self, axis: int) -> Sequence[Any]:
         if axis != SINGLE_MODE:
             raise RefusedError(BAD_AXIS, 0.0)
-        return self._ecu_getRefractiveIndex() if self._unit and self._unit_on else (1.0,)
-
-    def _ecu_getRefractiveIndexCompensationMode(self, axis: int) -> Sequence[Any]:
-        if axis != SINGLE_MODE:
-            raise RefusedError(BAD_AXIS, 0)
-        return (0,)
+        return self._ecu_getRefractiveIndex() if self._unit else (1.0,)
 
     def _service_getSerialNumber(self) -> Sequence[Any]:
         return ("L000S0042",)
 
     def _service_getFirmwareVersion(self) -> Sequence[Any]:
         return ("1.9.1" if "sen" in self._families else "1.7.0",)
-
-    def _service_getDeviceName(self) -> Sequence[Any]:
-        return ("virtual IDS",)
 
     def _service_errorNumberToString(self, language: int, number: int) -> Sequence[Any]:
         if language not in (0, 1):
