@@ -6,7 +6,6 @@ packets.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from errormotion.instruments.simulators.laser_tracker.leica_emscon import packets
@@ -14,7 +13,7 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures impo
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.points import BY_DISTANCE, BY_TIME, GRID
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.state_commands import CAMERA, LEVEL, StateCommands
+from errormotion.instruments.simulators.laser_tracker.leica_emscon.state_commands import LEVEL, StateCommands
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event, Status, out_of_range, wrong
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import NEST
 
@@ -32,24 +31,14 @@ class Commands(StateCommands):
         super().__init__(device)
         self._mode = STATIONARY
         self._reported_index = 0.0
-        self._last_point: Triple | None = None
 
     # ------------------------------------------------------------------ level
 
     def _do_Initialize(self) -> bytes:
         self._device.initialised = True
-        self._device.tracker.face = 1
         before = self._status_changes(Event.BUSY, Event.INITIALISATION)
         level = self._level() if self.system[LEVEL] else b""
         return before + level + self._ok("Initialize") + self._status_changes(Event.READY)
-
-    def _do_StartNivelMeasurement(self) -> int | bytes:
-        if not self.system[LEVEL]:
-            return Status.NO_LEVEL
-        return self._ok("StartNivelMeasurement") + self._level()
-
-    def _do_CallOrientToGravity(self) -> int | list[Any]:
-        return list(TILT) if self.system[LEVEL] else Status.NO_LEVEL
 
     def _level(self) -> bytes:
         temperature = self._device.tracker.scene.air()[0]
@@ -58,16 +47,7 @@ class Commands(StateCommands):
     # ------------------------------------------------------------------ motions
 
     def _do_GetDirection(self) -> list[Any]:
-        tracker = self._device.tracker
-        return list((tracker.pointing if self._away else tracker.now())[:2])
-
-    @property
-    def _away(self) -> bool:
-        """Whether the beam was pointed away from the reflector."""
-        return self._device.tracker.broken and self._device.tracker.pointing != NEST
-
-    def _do_GetCurrentPrismPosition(self) -> list[Any] | int:
-        return Status.NOT_READY if self._device.tracker.broken else [self._device.tracker.now()]
+        return list(self._device.tracker.now()[:2])
 
     def _do_GoBirdBath(self) -> bytes:
         before, self._device.tracker.nested = self._device.use_beam(), True
@@ -79,9 +59,6 @@ class Commands(StateCommands):
         before, self._device.tracker.nested = self._device.use_beam(), True
         return self._moved("GoBirdBath2", before, found=True)
 
-    def _do_CheckBirdBath(self) -> list[Any] | int:
-        return [*NEST, 0.0, 0.0, 0.0]
-
     def _do_FindReflector(self, distance: float) -> bytes | int:
         if distance < 0:
             return out_of_range(1)
@@ -89,18 +66,6 @@ class Commands(StateCommands):
 
     def _do_GoPosition(self, position: Triple, use_adm: int) -> bytes | int:
         return self._go("GoPosition", position, use_adm)
-
-    def _do_GoPositionHVD(self, azimuth: float, zenith: float, distance: float, use_adm: int) -> bytes | int:
-        return self._go("GoPositionHVD", (azimuth, zenith, distance), use_adm)
-
-    def _do_GoLastMeasuredPoint(self) -> bytes | int:
-        if self._last_point is None:
-            return Status.NO_LAST_POINT
-        return self._go("GoLastMeasuredPoint", self._last_point, 0)
-
-    def _do_LookForTarget(self, position: Triple, radius: float) -> list[Any] | int:
-        found = self._device.tracker.near(position, radius) and not self._device.tracker.obstructed()
-        return list(self._device.tracker.now()[:2]) if found else Status.NO_RESULT
 
     def _go(self, name: str, position: Triple, use_adm: int) -> bytes | int:
         if use_adm not in (0, 1):
@@ -123,49 +88,7 @@ class Commands(StateCommands):
         tracker.pointing = NEST
         return before + self._device.locked() + self._ok(name)
 
-    def _do_PointLaser(self, position: Triple) -> bytes:
-        return self._point("PointLaser", position)
-
-    def _do_PointLaserHVD(self, azimuth: float, zenith: float, distance: float) -> bytes:
-        return self._point("PointLaserHVD", (azimuth, zenith, distance))
-
-    def _do_PositionRelativeHV(self, azimuth: float, zenith: float) -> bytes:
-        a, z, distance = self._device.tracker.now()
-        return self._point("PositionRelativeHV", (a + azimuth, z + zenith, distance))
-
-    def _do_MoveHV(self, azimuth: int, zenith: int) -> int | bytes:
-        for position, speed in enumerate((azimuth, zenith), 1):
-            if not -100 <= speed <= 100:
-                return out_of_range(position)
-        return self._point("MoveHV", self._device.tracker.now()) if azimuth or zenith else Status.OK
-
-    def _do_GoNivelPosition(self, position: int) -> int | bytes:
-        if not 0 <= position <= 3:
-            return wrong(1)
-        if not self.system[LEVEL]:
-            return Status.NO_LEVEL
-        return self._point("GoNivelPosition", (position * math.pi / 2, math.pi / 2, 1.0))
-
-    def _do_ActivateCameraView(self) -> int | bytes:
-        if not self.system[CAMERA]:
-            return Status.NO_VIDEO_CAMERA
-        return self._point("ActivateCameraView", self._device.tracker.now())
-
-    def _point(self, name: str, direction: Triple) -> bytes:
-        """Point the beam in a direction without a reflector: it is broken."""
-        tracker = self._device.tracker
-        tracker.broken, tracker.pointing = True, direction
-        return self._ok(name) + self._status_changes(Event.NOT_READY)
-
-    def _do_ChangeFace(self) -> bytes:
-        tracker = self._device.tracker
-        tracker.face = 3 - tracker.face
-        return self._ok("ChangeFace") + self._status_changes(Event.FACE_1 if tracker.face == 1 else Event.FACE_2)
-
     # ------------------------------------------------------------------ measuring
-
-    def _do_GetMeasurementMode(self) -> list[Any]:
-        return [self._mode]
 
     def _do_SetMeasurementMode(self, mode: int) -> int | bytes:
         absolute = self._device.tracker.absolute
@@ -216,7 +139,7 @@ class Commands(StateCommands):
         if abs((index := tracker.index()) - self._reported_index) > 1e-8:
             self._reported_index = index
             change = self._status_changes(Event.REFRACTION)
-        self._last_point = position = tracker.now()
+        position = tracker.now()
         extended = device.always_extended or device.blocks[NUMBERS["SetStatisticMode"]].values[0]
         spread, errors = device.spread(position), [0.0, 0.0, 0.0]
         mode = self._mode if self._mode not in PROFILES else STATIONARY

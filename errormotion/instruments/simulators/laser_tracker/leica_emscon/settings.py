@@ -128,37 +128,3 @@ def blocks(*, newest: bool) -> dict[int, Block]:
         ),
     }
     return {NUMBERS[name]: block for name, block in named.items()}
-
-
-PARAMETERS: dict[int, tuple[float, float, float, bool]] = {
-    0: (0, 0, 1, True),  # keep last position
-    1: (0, 0, 2, True),  # weather monitor
-    2: (0, 0, 1, True),
-    3: (1, 0, 1, True),
-    10: (1, 0, 1, True),  # display reflector position
-    50: (0, 0, 2, True),
-    51: (0, 0, 1, True),
-    52: (0, 0, 2, True),
-    53: (3, 0, 7, True),
-    54: (30, 2, 255, True),
-    60: (0, -1, 1, False),
-    200: (0, 0, 10, True),  # size of the command queue
-    300: (0, 0, 0, False),
-    400: (3, 3, 10, True),  # packets per second
-    410: (0, 0, 1, False),
-    411: (0, 0, 1, True),
-    450: (0, 0, 2, True),
-    5000: (110, 0, 120, False),
-    5001: (110, 0, 110, False),
-    5002: (2, 0, 2, True),
-}
-"""System parameters (ES_SystemParameter): default, lowest, highest value, and whether a client may set them."""
-DOUBLES: dict[int, tuple[str, float, bool]] = {
-    1000: ("T", 1.0, True),  # thresholds from which a change of the air is reported
-    1001: ("P", 500.0, True),
-    1002: ("d", 10.0, True),
-    1100: ("L", 80.0, False),  # longest distances
-    1101: ("L", 80.0, False),
-    1102: ("L", 30.0, False),
-}
-"""System parameters that are doubles: kind, default, and whether a client may set them."""

@@ -14,7 +14,6 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon.information i
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.measures import SYSTEMS, Units
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.packets import NUMBERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.server import Server
-from errormotion.instruments.simulators.laser_tracker.leica_emscon.settings import DOUBLES, PARAMETERS
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import Event, Status, out_of_range, wrong
 from errormotion.instruments.simulators.laser_tracker.leica_emscon.tracker import METEO_REFRACTION
 
@@ -37,12 +36,14 @@ class StateCommands:
         self._device = device
         self.system = [0, 0, 0, 0, 1, 1, 0, 1, 0]
         self._reflector = 1
-        self._parameters = {number: default for number, (default, _, _, _) in PARAMETERS.items()}
-        self._doubles = {number: default for number, (_, default, _) in DOUBLES.items()}
 
     def do(self, name: str, values: Sequence[Any]) -> bytes | int | list[Any]:
-        """Execute a command; return all packets, a status, or the values of the reply."""
-        found: bytes | int | list[Any] = getattr(self, f"_do_{name}")(*values)
+        """Execute a command; return all packets, a status, or the values of the reply.
+
+        The server has the commands of the driver and of CESAPI's client; others are not implemented.
+        """
+        command = getattr(self, f"_do_{name}", None)
+        found: bytes | int | list[Any] = Status.NOT_IMPLEMENTED if command is None else command(*values)
         return found
 
     def set_block(self, number: int, values: list[Any]) -> bytes:
@@ -70,27 +71,9 @@ class StateCommands:
             return [1]
         return [2 if self._ready else 0]
 
-    def _do_GetMeasurementStatusInfo(self) -> list[Any]:
-        bits = 1 | 2 | 4 | 8 | 32768
-        tracker = self._device.tracker
-        bits |= 0 if tracker.broken else 2048
-        bits |= 4096 if tracker.face == 1 else 0
-        bits |= 65536 if self._device.initialised else 0
-        return [0, bits]
-
     @property
     def _ready(self) -> bool:
         return self._device.initialised and not self._device.tracker.broken
-
-    def _do_GetFace(self) -> list[Any]:
-        return [self._device.tracker.face]
-
-    def _do_GetObjectTemperature(self) -> list[Any]:
-        return [self._device.tracker.scene.air()[0]]
-
-    def _do_RestoreStartupConditions(self) -> bytes:
-        self._device.wire.units = Units()
-        return self._ok("RestoreStartupConditions") + self._status_changes(Event.UNITS)
 
     # ------------------------------------------------------------------ units, coordinates, settings
 
@@ -131,38 +114,6 @@ class StateCommands:
         self.system = list(values)
         self._device.tracker.meteo = values[METEO]
         return self._ok("SetSystemSettings") + self._status_changes(Event.SYSTEM_SETTINGS)
-
-    def _do_GetLongSystemParameter(self, number: int) -> list[Any] | int:
-        return [number, int(self._parameters[number])] if number in PARAMETERS else wrong(1)
-
-    def _do_SetLongSystemParameter(self, number: int, value: int) -> int:
-        if number not in PARAMETERS or not PARAMETERS[number][3]:
-            return wrong(1)
-        _, low, high, _ = PARAMETERS[number]
-        if not low <= value <= high:
-            return out_of_range(2)
-        self._parameters[number] = value
-        for parameter, index in ((0, KEEP), (1, METEO), (10, POSITION)):
-            if number == parameter:
-                self.system[index] = value
-        self._device.tracker.meteo = self.system[METEO]
-        return Status.OK
-
-    def _do_GetDoubleSystemParameter(self, number: int) -> list[Any] | int:
-        if number not in DOUBLES:
-            return wrong(1)
-        return [number, self._device.wire.units.out(DOUBLES[number][0], self._doubles[number])]
-
-    def _do_SetDoubleSystemParameter(self, number: int, value: float) -> int:
-        if number not in DOUBLES or not DOUBLES[number][2]:
-            return wrong(1)
-        self._doubles[number] = self._device.wire.units.into(DOUBLES[number][0], value)
-        return Status.OK
-
-    def _do_SetCompensation(self, number: int) -> int | bytes:
-        if number != 1:
-            return Status.NO_SUCH_COMPENSATION
-        return self._ok("SetCompensation") + self._status_changes(Event.COMPENSATION)
 
     # ------------------------------------------------------------------ reflectors
 

@@ -57,7 +57,6 @@ class Tracker:
         self._uses = 0
         self.broken = False
         self.nested = False  # the reflector is in the nest at the tracker
-        self.face = 1
         self.pointing = NEST  # direction of the beam without a reflector
         self.meteo = NO_METEO
         self._set_air = (20.0, 101_325.0, 50.0)
