@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import FitError
 from errormotion.kinematics.fits import fit_circle, fit_cone, fit_cylinder, fit_line, fit_plane, fit_sphere
@@ -53,7 +54,7 @@ def test_invalid_points_are_refused(fit):
         fit(np.zeros(20))
     with pytest.raises(FitError, match=r"found \(3, 20\)"):
         fit(np.zeros((3, 20)))
-    with pytest.raises(FitError, match="array of numbers"):
+    with raises("shape.points.form"):
         fit([("a", "b", "c")])
     with pytest.raises(FitError, match=r"at least \d points; found 0"):
         fit(np.zeros((0, 3)))
@@ -88,7 +89,7 @@ def test_options_are_checked(options, message):
 
 
 def test_radius_and_direction_of_a_cylinder_are_checked():
-    with pytest.raises(FitError, match="positive radius"):
+    with raises("shape.radius.not_positive"):
         fit_cylinder(PLANE, -1.0)
-    with pytest.raises(FitError, match="direction of three numbers"):
+    with raises("shape.direction.form"):
         fit_cylinder(PLANE, direction=[0, 0, 0])

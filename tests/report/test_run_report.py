@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from coded import raises
 
 from errormotion.datasets import save
 from errormotion.errors import RunError
@@ -44,7 +45,7 @@ def test_simulation_stated_only_in_the_run_is_detected(run_folder):
 
 
 def test_a_folder_without_results_is_reported_with_a_remedy(tmp_path):
-    with pytest.raises(RunError, match="errormotion identify"):
+    with raises("run.no_errors"):
         write_run_report(tmp_path)
 
 
