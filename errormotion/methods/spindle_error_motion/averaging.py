@@ -13,10 +13,27 @@ from errormotion.arrays import Array
 from errormotion.compiling import Compiler
 
 compiled = Compiler("the loops for spindle error motions", seconds=6, error_model="numpy")
-DRAWS = 4
+DRAWS = 3
 """Extremes with further noise, which state the bias by the noise."""
-_REACH = 5.5
-"""Largest magnitude of a normal number that the noise has; its own is about 4.5 in a table of 2^16."""
+
+
+@compiled()
+def interpolated(time: Array, knots: Array, values: Array, slope: Array, found: Array) -> None:
+    """Write values at increasing times, between knots by cubic polynomials with these slopes; NaN outside of them."""
+    j = max(np.searchsorted(knots, time[0], side="right") - 1, 0) if time.size else 0
+    last = knots.size - 2
+    for i in range(time.size):
+        t = time[i]
+        if t < knots[0] or t > knots[last + 1]:
+            found[i] = np.nan
+            continue
+        while j < last and knots[j + 1] <= t:
+            j += 1
+        h = knots[j + 1] - knots[j]
+        x = (t - knots[j]) / h
+        d, m0, m1 = values[j + 1] - values[j], h * slope[j], h * slope[j + 1]
+        # Hermite: a + x m0 + x^2 (3 d - 2 m0 - m1) + x^3 (m0 + m1 - 2 d)
+        found[i] = values[j] + x * (m0 + x * (3 * d - 2 * m0 - m1 + x * (m0 + m1 - 2 * d)))
 
 
 @compiled(inline="always")
@@ -112,9 +129,9 @@ def extremes(
     ----------
     reading, turn, sense, turns, limit
         As in `add_up`; spikes are searched in what is not synchronous.
-    table : ndarray, (sensor, t + 1)
+    table : ndarray, (t + 1, sensor)
         Synchronous part of the readings at t even angles of the axis, and the first again, m.
-    drift : ndarray, (sensor, batch)
+    drift : ndarray, (batch, sensor)
         Slow changes of the readings at the middle of each batch of turns, m.
     weight : ndarray, (sector, curve, sensor)
         Effect of readings on each curve.
@@ -132,14 +149,22 @@ def extremes(
     sensors, n = reading.shape
     sectors, curves = weight.shape[0], weight.shape[1]
     draws = noisy_low.shape[0]
-    steps = table.shape[1] - 1
-    batches = drift.shape[1]
+    steps = table.shape[0] - 1
+    batches = drift.shape[0]
     mask = normal.size - 1
     state = np.uint64(seed)
     rest = np.empty((3, sensors))
     known = np.zeros(3, np.bool_)
+    reached = np.abs(normal).max() * noise
+    # Values between these are no extremes, with or without noise
+    inner_low, inner_high = np.empty((curves, sectors)), np.empty((curves, sectors))
+    for c in range(curves):
+        for s in range(sectors):
+            inner_low[c, s] = max(low[c, s], noisy_low[:, c, s].max() + reached[c])
+            inner_high[c, s] = min(high[c, s], noisy_high[:, c, s].min() - reached[c])
+    now, middle, last = 0, 1, 2
     for j in range(n + 1):  # sample j comes in, sample j - 1 is evaluated with its neighbours
-        now, middle, last = j % 3, (j + 2) % 3, (j + 1) % 3
+        now, middle, last = last, now, middle
         known[now] = False
         if j < n and turn[j] >= 0.0 and turn[j] < turns:
             u = turn[j]
@@ -153,8 +178,8 @@ def extremes(
             next_one = min(k + 1, batches - 1)
             known[now] = True
             for i in range(sensors):
-                r = reading[i, j] - (1.0 - x) * table[i, t] - x * table[i, t + 1]
-                r -= (1.0 - w) * drift[i, k] + w * drift[i, next_one]
+                r = reading[i, j] - (1.0 - x) * table[t, i] - x * table[t + 1, i]
+                r -= (1.0 - w) * drift[k, i] + w * drift[next_one, i]
                 rest[now, i] = r
                 if np.isnan(r):
                     known[now] = False
@@ -176,14 +201,15 @@ def extremes(
             for i in range(sensors):
                 v += weight[s, c, i] * rest[middle, i]
             power[c] += v * v
+            if v > inner_low[c, s] and v < inner_high[c, s]:
+                continue  # as most: no noise makes it an extreme
             low[c, s] = min(low[c, s], v)
             high[c, s] = max(high[c, s], v)
-            reach = _REACH * noise[c]
             for d in range(draws):
-                if v - reach > noisy_low[d, c, s] and v + reach < noisy_high[d, c, s]:
-                    continue
                 state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
                 noisy = v + noise[c] * normal[(state >> np.uint64(33)) & np.uint64(mask)]
                 noisy_low[d, c, s] = min(noisy_low[d, c, s], noisy)
                 noisy_high[d, c, s] = max(noisy_high[d, c, s], noisy)
+            inner_low[c, s] = max(low[c, s], noisy_low[:, c, s].max() + reached[c])
+            inner_high[c, s] = min(high[c, s], noisy_high[:, c, s].min() - reached[c])
     return int(state >> np.uint64(2))

@@ -24,8 +24,10 @@ tilt                    the same of the inclination of the axis, rad: ``W_j`` to
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -35,7 +37,7 @@ from errormotion.arrays import Array
 from errormotion.estimation.extremes import FLAT, POINTED, expanded, of_noisy_values
 from errormotion.methods.spindle_error_motion.averaging import DRAWS, extremes
 from errormotion.methods.spindle_error_motion.layout import Layout
-from errormotion.methods.spindle_error_motion.synchronous import Synchronous, limits
+from errormotion.methods.spindle_error_motion.synchronous import SAMPLE, Synchronous, limits
 from errormotion.methods.spindle_error_motion.turning import TAU, Turning, angles_of, chunks
 
 _TABLE = 4096
@@ -121,45 +123,69 @@ def spread_of(
     raw: xr.Dataset, layout: Layout, turning: Turning, mean: Synchronous, curves: list[Curve], noise: float
 ) -> Spread:
     """Return the extremes over all turns of a record, which is read once more."""
-    sectors = len(curves[0].weight)
     to_curves = np.array([curve.weight for curve in curves]).transpose(1, 0, 2) @ layout.solver
     size = noise * np.sqrt(np.mean(np.square(to_curves).sum(axis=2), axis=0))
     normal = np.random.default_rng(_SEED).standard_normal(_NORMAL)
     grid = np.arange(_TABLE + 1) * TAU / _TABLE
-    table = np.ascontiguousarray(mean.at(grid))
-    drift = np.ascontiguousarray(mean.level)
-    shape = (len(curves), sectors)
-    low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
-    noisy_low, noisy_high = np.full((DRAWS, *shape), np.inf), np.full((DRAWS, *shape), -np.inf)
-    power, before, seed, limit = np.zeros(len(curves) + 1), np.nan, _SEED, mean.limit
-    for number, chunk in enumerate(chunks(raw)):
-        angle, before = angles_of(chunk, turning, before)
-        turn = angle / TAU
-        if number == 0 and np.isfinite(mean.limit).any():
-            place = np.nan_to_num(turning.sense * angle)
-            rest = chunk.reading - np.array([np.interp(place % TAU, grid, row) for row in table])
-            limit = np.maximum(np.minimum(limits(rest), mean.limit), 4 * mean.step)
-        seed = extremes(
-            chunk.reading,
-            turn,
-            turning.sense,
-            turning.turns,
-            limit,
-            table,
-            drift,
-            np.ascontiguousarray(to_curves),
-            size,
-            normal,
-            seed,
-            low,
-            high,
-            noisy_low,
-            noisy_high,
-            power,
-        )
-    for each in (low, high, noisy_low, noisy_high):
+    table = mean.at(grid)
+    by_angle = np.ascontiguousarray(table.T)
+    drift = np.ascontiguousarray(mean.level.T)
+    groups = [_Group.of(to_curves[:, part], size[part], seed) for seed, part in enumerate(_parts(len(curves)))]
+    before, limit = np.nan, mean.limit
+    with ThreadPoolExecutor(len(groups)) as pool:
+        for number, chunk in enumerate(chunks(raw)):
+            angle, before = angles_of(chunk, turning, before)
+            if number == 0 and np.isfinite(mean.limit).any():
+                place = np.nan_to_num(turning.sense * angle[:SAMPLE])
+                rest = chunk.reading[:, :SAMPLE] - np.array([np.interp(place % TAU, grid, row) for row in table])
+                limit = np.maximum(np.minimum(limits(rest), mean.limit), 4 * mean.step)
+            given = chunk.reading, angle / TAU, turning.sense, turning.turns, limit, by_angle, drift
+            running = [pool.submit(group.update, normal, *given) for group in groups]
+            for each in running:
+                each.result()
+    low, high, rms = (np.concatenate([getattr(group, name) for group in groups]) for name in ("low", "high", "rms"))
+    noisy = [np.concatenate([getattr(group, name) for group in groups], axis=1) for name in ("noisy_low", "noisy_high")]
+    for each in (low, high, *noisy):
         each[np.isinf(each)] = np.nan  # no sample
-    return Spread(low, high, noisy_low, noisy_high, np.sqrt(power[:-1] / max(power[-1], 1.0)), size)
+    return Spread(low, high, noisy[0], noisy[1], rms, size)
+
+
+def _parts(count: int) -> list[slice]:
+    """Return the curves of two threads; the result does not depend on whether they run at the same time."""
+    half = (count + 1) // 2
+    return [slice(0, half), slice(half, count)] if count > 1 else [slice(0, 1)]
+
+
+@dataclass(eq=False)
+class _Group:
+    """Curves that one thread follows: see `errormotion.methods.spindle_error_motion.averaging.extremes`."""
+
+    weight: Array
+    noise: Array
+    seed: int
+    low: Array
+    high: Array
+    noisy_low: Array
+    noisy_high: Array
+    power: Array
+
+    @classmethod
+    def of(cls, weight: Array, noise: Array, number: int) -> _Group:
+        """Return curves without samples; ``weight`` is (sector, curve, sensor)."""
+        shape = (weight.shape[1], weight.shape[0])
+        extreme = [np.full(each, sign * np.inf) for each in (shape, (DRAWS, *shape)) for sign in (1, -1)]
+        power = np.zeros(shape[0] + 1)
+        return cls(np.ascontiguousarray(weight), noise.copy(), _SEED + number, *extreme, power)
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of each curve."""
+        return np.asarray(np.sqrt(self.power[:-1] / max(self.power[-1], 1.0)))
+
+    def update(self, normal: Array, *given: Any) -> None:
+        """Follow the samples of a chunk."""
+        extreme = self.low, self.high, self.noisy_low, self.noisy_high
+        self.seed = extremes(*given, self.weight, self.noise, normal, self.seed, *extreme, self.power)
 
 
 @dataclass(frozen=True, eq=False)

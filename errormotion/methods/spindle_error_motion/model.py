@@ -209,20 +209,24 @@ def _problem(record: Record, notes: list[str]) -> Problem:
 def _form(raw: xr.Dataset, roundness: float, sections: int, harmonics: int) -> tuple[Array, Array, Array]:
     """Return undulations (h,), the stated form (section, 2 h), m, and its independent sources.
 
-    A roundness deviation is distributed over 2 ... `FORM` undulations: each coefficient has a standard uncertainty
+    Undulations above the harmonics of the mean readings are no part of them. A roundness deviation is distributed over
+    2 ... `FORM` undulations: each coefficient has a standard uncertainty
     u_k as 1 / k with sum u_k^2 = (roundness / `PEAKS`)^2, cosine and sine alike, independently in each section.
     """
     stated = "form_cosine" in raw and "form_sine" in raw
     given = np.asarray(raw["undulation"].values, int) if stated and "undulation" in raw else np.zeros(0, int)
     if stated and not given.size:
         raise MethodError("undulation: expected the undulations in one turn of form_cosine and form_sine; found none")
-    orders = np.union1d(given, np.arange(2, min(FORM, harmonics) + 1))
+    seen = given <= harmonics
+    orders = np.union1d(given[seen], np.arange(2, min(FORM, harmonics) + 1))
     value = np.zeros((sections, 2 * orders.size))
     if stated:
-        at = np.searchsorted(orders, given)
-        value[:, at], value[:, orders.size + at] = raw["form_cosine"].values, raw["form_sine"].values
+        at = np.searchsorted(orders, given[seen])
+        value[:, at] = raw["form_cosine"].values[seen]
+        value[:, orders.size + at] = raw["form_sine"].values[seen]
+    share = 1.0 / np.arange(2, FORM + 1)
     u = np.where((orders >= 2) & (orders <= FORM), 1.0 / np.maximum(orders, 1), 0.0)
-    u *= roundness / PEAKS / max(float(np.sqrt(np.square(u).sum())), 1e-300)
+    u *= roundness / PEAKS / float(np.linalg.norm(share))
     both = np.concatenate([u, u])
     live = np.flatnonzero(both)
     factor = np.zeros((sections, both.size, sections * live.size))

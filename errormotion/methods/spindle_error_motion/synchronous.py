@@ -37,11 +37,13 @@ SAMPLE = 20_000
 """Readings of each sensor from whose differences the step of its scale is found."""
 SPIKE = 8.0
 """Distance of a spike from its neighbours, in robust standard deviations."""
-SPIKES = 1e-3
+FEWEST_READINGS = 100
+"""Of a sensor, from which the distance of a spike follows."""
+SPIKES = 2e-3
 """Largest share of spikes; where there are more, they are no accidents."""
 _NYQUIST = 0.9
-_LINGERING = 0.3
-"""Correlation of neighbouring batches above which they are not independent."""
+_LINGERING = 2.0
+"""Variance of the mean of the batches, relative to that of independent ones, from which on they are alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +126,7 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
         angle, before = angles_of(chunk, turning, before)
         if number == 0:
             step = np.array([step_of(each[:SAMPLE]) for each in chunk.reading])
-            limit = np.maximum(limits(chunk.reading), 4 * step)
+            limit = np.maximum(limits(chunk.reading[:, :SAMPLE]), 4 * step)
         turn = angle / TAU
         seen += int(np.count_nonzero((turn >= 0) & (turn < turning.turns)))
         spikes += add_up(chunk.reading, turn, turning.sense, turning.turns, limit, count, offset, square, total)
@@ -140,13 +142,13 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
 
 def limits(reading: Array) -> Array:
     """Return the distance of spikes from their neighbours, (sensor,), m; infinite where they are no accidents."""
-    d = reading[:, 1:-1] - (reading[:, :-2] + reading[:, 2:]) / 2
     found = np.full(len(reading), np.inf)
-    for i, each in enumerate(d):
-        known = each[np.isfinite(each)]
-        if known.size > 100:
-            limit = SPIKE * float(scale_about_zero(known))
-            if limit > 0 and np.mean(np.abs(known) > limit) < SPIKES:
+    for i, (before, value, after) in enumerate(zip(reading[:, :-2], reading[:, 1:-1], reading[:, 2:], strict=True)):
+        d = np.abs(value - (before + after) / 2)
+        known = np.isfinite(d)
+        if known.sum() > FEWEST_READINGS:
+            limit = SPIKE * float(scale_about_zero(d[known]))
+            if limit > 0 and np.mean((d > limit) & (np.abs(after - before) < d / 2)) < SPIKES:
                 found[i] = limit
     return found
 
@@ -192,14 +194,13 @@ def _fitted(
         found[b] = np.linalg.solve(design.T @ weighted, weighted.T @ means[:, b, there].T)
     used = found[kept]
     batches = len(used)
-    phi = _lingering(used)
-    if phi > _LINGERING:
+    slow = _lingering(used)
+    if slow > _LINGERING:
         doubts.append(
-            f"Neighbouring batches of turns are alike (correlation {phi:.2f}): the error motion changes slowly, or "
-            "contains a motion whose frequency nearly is a multiple of the speed. Its uncertainty is increased; a "
-            "longer record separates them."
+            "Neighbouring batches of turns are alike: the error motion changes slowly, or contains a motion whose "
+            "frequency nearly is a multiple of the speed. The uncertainty of the mean over turns is increased by a "
+            f"factor of {np.sqrt(slow):.1f}; a longer record separates them."
         )
-    slow = np.sqrt((1 + phi) / (1 - phi)) if phi > _LINGERING else 1.0
     level = np.where(kept[:, None], found[:, 0], np.nan)
     notes += _leftover(used, count[kept], middle[kept], variance[kept], means[:, kept])
     valid = int(count[kept].sum())
@@ -208,7 +209,7 @@ def _fitted(
         notes.append(f"{spikes} readings stand out from both neighbours; these samples are not used.")
     if missing > 0:
         notes.append(f"{missing} of {seen} samples have no reading of one or more sensors and are not used.")
-    factor = float(expansion(batches - 1)) * float(slow)
+    factor = float(expansion(batches - 1)) * float(np.sqrt(slow) if slow > _LINGERING else 1.0)
     levels, none = _levels(level, turns / len(count)), np.zeros(len(means))
     return Synchronous(used, levels, factor, valid, limit, spikes, max(missing, 0), none, none, notes, doubts)
 
@@ -246,14 +247,22 @@ def _gap(angle: Array) -> float:
 
 
 def _lingering(coefficient: Array) -> float:
-    """Return the correlation of neighbouring batches, of all harmonics but the eccentricity, 0 to 0.9."""
-    K = (coefficient.shape[1] - 1) // 2
+    """Return the ratio of the variance of the mean of the batches to that of independent ones, at least 1.
+
+    ``1 + 2 sum_k (1 - k / B) rho_k``, with the correlation rho_k of batches k apart, of all harmonics but the
+    eccentricity, up to a quarter of the batches: a vibration whose phase turns from batch to batch averages out.
+    """
+    K, batches = (coefficient.shape[1] - 1) // 2, len(coefficient)
     rows = [k for k in range(1, 2 * K + 1) if k not in (1, K + 1)]
     off = coefficient[:, rows] - coefficient[:, rows].mean(axis=0)
-    if len(off) < 8 or not off.any():
-        return 0.0
-    phi = float((off[1:] * off[:-1]).sum() / np.square(off).sum()) + 1.0 / len(off)
-    return float(np.clip(phi, 0.0, 0.9))
+    if batches < 8 or not off.any():
+        return 1.0
+    total = 1.0
+    for k in range(1, batches // 4 + 1):
+        # The removed mean makes each correlation smaller by 1 / B
+        rho = float((off[k:] * off[:-k]).sum() / np.square(off).sum()) * batches / (batches - k) + 1 / batches
+        total += 2 * (1 - k / batches) * rho
+    return max(total, 1.0)
 
 
 def _levels(level: Array, turns: float) -> Array:

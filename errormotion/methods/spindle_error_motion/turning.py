@@ -16,6 +16,7 @@ from xarray.indexes import RangeIndex
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.spindle_error_motion.averaging import interpolated
 from errormotion.methods.spindle_error_motion.layout import Layout
 
 TAU = 2 * np.pi
@@ -57,16 +58,10 @@ class Turning:
 
     def at(self, time: Array) -> Array:
         """Return the angles at increasing times, rad, from the start of the first whole turn; NaN outside the knots."""
-        t, a = self.knots, self.angles
-        slope = np.gradient(a, t)  # second order, also for uneven knots
-        j = np.clip(np.searchsorted(t, time, side="right") - 1, 0, t.size - 2)
-        h = (t[1:] - t[:-1])[j]
-        x = (time - t[j]) / h
-        d = (a[1:] - a[:-1])[j]
-        m0, m1 = h * slope[j], h * slope[j + 1]
-        # Hermite: a + x m0 + x^2 (3 d - 2 m0 - m1) + x^3 (m0 + m1 - 2 d)
-        found = a[j] + x * (m0 + x * (3 * d - 2 * m0 - m1 + x * (m0 + m1 - 2 * d)))
-        return np.asarray(np.where((time < t[0]) | (time > t[-1]), np.nan, found))
+        slope = np.gradient(self.angles, self.knots)  # second order, also for uneven knots
+        found = np.empty(time.size)
+        interpolated(time, self.knots, self.angles, slope, found)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
