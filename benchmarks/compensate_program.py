@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.compensation.correction import correction
-from errormotion.compensation.program import ByTool, Offsets, Reader, Rewriting, Settings, compensate
+from errormotion.compensation.program import ByTool, Offsets, ProgramSettings, Reader, Rewriting, compensate
 from errormotion.compensation.program.interpreter.canonical import interpreter
 from errormotion.twin import VirtualMachine
 
@@ -42,7 +42,7 @@ def speed(folder: Path) -> None:
     correcting, offsets = volume(), Offsets().with_system("G54", (0.0, 0.0, 0.2))
     list(Rewriting(Reader(offsets), correcting).lines(["G0 X0 Y0 Z0", "G1 X100 F100", "M2"]))  # for the compilation
     start, cpu = time.perf_counter(), time.process_time()
-    found = compensate(part, out, correcting, offsets, Settings())
+    found = compensate(part, out, correcting, offsets, ProgramSettings())
     wall, used = time.perf_counter() - start, time.process_time() - cpu
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(

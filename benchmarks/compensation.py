@@ -22,7 +22,7 @@ from pymodbus.client import ModbusTcpClient
 
 from errormotion import plugins
 from errormotion.compensation.online.prediction import predictor
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.errors import InstrumentError
 from errormotion.instruments.transports import load_simulator, parse_address
 from errormotion.testing.run import subjects_of
@@ -58,7 +58,7 @@ def prediction() -> Callable[[int], object]:
     for speeds in ([(0, 6000), (3600, 12000), (7200, 0)], [(0, 15000), (2400, 3000), (6000, 9000)]):
         machine.start([Event(at, speed, OFF if at == 0 else None) for at, speed in speeds])
         warm_ups.append(machine.truth_spindle(np.arange(0.0, 10801.0, 360.0)))
-    found = predictor(fit(warm_ups, Settings(variant="lagged")).dataset)
+    found = predictor(fit(warm_ups, ThermalModelSettings(variant="lagged")).dataset)
     names, clock = found.temperatures, iter(range(1 << 30))
     rng = np.random.default_rng(1)
     return lambda _: found.update(

@@ -9,7 +9,7 @@ import numpy as np
 
 from errormotion.cli.demo.closed_loop import Duty, Loop, Speeds, close
 from errormotion.compensation.online.prediction import predictor
-from errormotion.compensation.thermal_model import Settings as ModelSettings
+from errormotion.compensation.thermal_model import ThermalModelSettings
 from errormotion.twin import VirtualMachine
 
 TITLE = "Closed loop"
@@ -41,7 +41,7 @@ def section(seeds: int) -> Iterator[str]:
     )
     for title, first, model in (
         ("At most 2 sensors and 2 time constants", seeds, duty.model),
-        ("Sensors and time constants as selected by default", 0, ModelSettings(variant="dynamics")),
+        ("Sensors and time constants as selected by default", 0, ThermalModelSettings(variant="dynamics")),
     ):
         yield from ("", f"### {title}", "")
         yield from _table(range(first, first + seeds), replace(duty, model=model))

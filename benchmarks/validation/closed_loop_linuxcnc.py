@@ -25,7 +25,7 @@ from errormotion.cli.commands.campaigns.run import work
 from errormotion.cli.demo import compensated_probing
 from errormotion.cli.demo.closed_loop import DISPLACEMENTS, with_warm_sensors
 from errormotion.compensation.online.prediction import predictor
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.instruments.simulators import world
 from validation.closed_loop import VARIATION, individual
 
@@ -40,7 +40,7 @@ INTERVAL = 600.0
 CYCLES = {"training": 16, "compensated": 13}
 WARM_UPS = (2, 3)
 """Those with compensation."""
-MODEL = Settings(variant="lagged", lags=(), most_sensors=2)
+MODEL = ThermalModelSettings(variant="lagged", lags=(), most_sensors=2)
 """Only present temperatures: simulated minutes are skipped, and the compensation would assume seconds."""
 BALLS = (0, 2, 3)
 ROUTES = {"feedback": "linuxcnc_feedback", "external": "linuxcnc_offset"}

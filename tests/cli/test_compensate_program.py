@@ -9,7 +9,7 @@ from command_line import CliRunner
 
 from errormotion import datasets
 from errormotion.cli.app import app
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.twin import Event, VirtualMachine
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -123,7 +123,7 @@ def test_a_thermal_model_requires_temperatures_and_uses_the_last(part: Path, tmp
         machine.start((Event(0.0, speeds[0], off), Event(3600.0, speeds[1])))
         days.append(machine.truth_spindle(np.arange(0.0, 7201.0, 900.0)).load())
     sensor = str(days[0]["sensor"].values[0])
-    fit(days, Settings(variant="lagged", sensors=(sensor,), lags=(900.0,))).save(tmp_path / "model.nc")
+    fit(days, ThermalModelSettings(variant="lagged", sensors=(sensor,), lags=(900.0,))).save(tmp_path / "model.nc")
     datasets.save(days[0], tmp_path / "log.nc")
     code, text = run(part, "--with", tmp_path / "model.nc", "--offset", "G54=0,0,100")
     assert code == 1

@@ -14,12 +14,12 @@ from errormotion.campaign.files import load_campaign
 from errormotion.cli.demo import closed_loop, compensated, compensated_probing
 from errormotion.cli.demo.closed_loop import Duty, Loop, close
 from errormotion.compensation.online.settings import Limits
-from errormotion.compensation.thermal_model import Settings
+from errormotion.compensation.thermal_model import ThermalModelSettings
 from errormotion.twin import VirtualMachine
 
 SHORT = Duty(
     limits=Limits(period=10.0),
-    model=Settings(variant="dynamics", sensors=("motor", "column_front"), time_constants=(600.0, 3600.0)),
+    model=ThermalModelSettings(variant="dynamics", sensors=("motor", "column_front"), time_constants=(600.0, 3600.0)),
 )
 
 

@@ -9,7 +9,7 @@ from command_line import CliRunner
 
 from errormotion import datasets
 from errormotion.cli.app import app
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.twin import Event, VirtualMachine
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -26,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for early, late in ((6000.0, 12000.0), (15000.0, 4000.0), (10000.0, 14000.0)):
         machine.start((Event(0.0, early, OFF), Event(3600.0, late)))
         found.append(machine.truth_spindle(np.arange(0.0, 7201.0, 300.0)).load())
-    fit(found[:2], Settings(variant="lagged", sensors=("spindle_front",), lags=())).save(tmp_path / "m.nc")
+    fit(found[:2], ThermalModelSettings(variant="lagged", sensors=("spindle_front",), lags=())).save(tmp_path / "m.nc")
     datasets.save(found[2], tmp_path / "third.nc")
     return tmp_path
 

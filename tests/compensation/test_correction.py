@@ -9,7 +9,7 @@ import xarray as xr
 from coded import raises
 
 from errormotion.compensation.correction import Correction, correction
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 from errormotion.twin import Event, VirtualMachine
@@ -228,7 +228,7 @@ def test_an_unknown_rotation_is_refused_where_it_moves_the_tool() -> None:
 def test_a_thermal_model_corrects_and_flags_inputs_outside_its_training(
     warm_up: Callable[..., xr.Dataset], pair: list[xr.Dataset]
 ) -> None:
-    model = fit(pair, Settings(variant="lagged"))
+    model = fit(pair, ThermalModelSettings(variant="lagged"))
     seen = warm_up(3, 0)
     made = correction(model, data=seen)
     found = made.at(np.zeros((3, 3)), [3600.0, 7200.0, 1e6])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from undrawn import undrawn  # noqa: F401 - a fixture
 
-from errormotion.compensation.thermal_model import Settings, check, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, check, fit
 from errormotion.compensation.thermal_model.report import write_model_report
 from errormotion.datasets.schemas import DOF
 from errormotion.report import write_report
@@ -50,7 +50,9 @@ def warm_ups():
 
 @pytest.fixture(scope="module")
 def model(warm_ups):
-    settings = Settings(variant="auto", sensors=("spindle_front", "column"), lags=(600.0,), time_constants=(1800.0,))
+    settings = ThermalModelSettings(
+        variant="auto", sensors=("spindle_front", "column"), lags=(600.0,), time_constants=(1800.0,)
+    )
     return fit(warm_ups[:2], settings)
 
 

@@ -11,15 +11,15 @@ from coded import raises
 
 from errormotion import datasets
 from errormotion.compensation.online.settings import Limits
-from errormotion.compensation.thermal_model import Settings, ThermalModel, check, fit
+from errormotion.compensation.thermal_model import ThermalModel, ThermalModelSettings, check, fit
 from errormotion.compensation.thermal_model.fitting import MIN_SAMPLES
 from errormotion.compensation.thermal_model.model import ROWS
 from errormotion.compensation.thermal_model.plugin import ThermalModelDataset
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import DatasetError
 
-LAGGED = Settings(variant="lagged", lags=("10 min",))
-DYNAMICS = Settings(variant="dynamics", time_constants=("30 min",))
+LAGGED = ThermalModelSettings(variant="lagged", lags=("10 min",))
+DYNAMICS = ThermalModelSettings(variant="dynamics", time_constants=("30 min",))
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def model(pair: list[xr.Dataset]) -> ThermalModel:
 
 @pytest.mark.parametrize("settings", [LAGGED, DYNAMICS], ids=["lagged", "dynamics"])
 def test_a_warm_up_with_another_speed_profile_is_predicted(
-    settings: Settings, pair: list[xr.Dataset], warm_up: Callable[..., xr.Dataset]
+    settings: ThermalModelSettings, pair: list[xr.Dataset], warm_up: Callable[..., xr.Dataset]
 ) -> None:
     """The largest errors by at least 80 %; the rest of the small ones is measurement noise, 0.3 um."""
     third = warm_up(3, 2)
@@ -43,7 +43,7 @@ def test_a_warm_up_with_another_speed_profile_is_predicted(
 
 def test_intervals_cover_the_truth_over_machines(warm_up: Callable[..., xr.Dataset]) -> None:
     """Eight machines, six errors, thirty times each; the misfit is common to a machine, so one may deviate."""
-    settings = Settings(variant="lagged", sensors=("head", "motor", "column_front"), lags=("10 min",))
+    settings = ThermalModelSettings(variant="lagged", sensors=("head", "motor", "column_front"), lags=("10 min",))
     held = [check(fit([warm_up(s, 0), warm_up(s, 1)], settings), warm_up(s, 2)).held for s in range(10, 18)]
     assert np.mean(held) > 0.93
     assert np.min(np.mean(held, axis=1)) > 0.85
@@ -163,7 +163,7 @@ def test_one_campaign_alone_is_reported(pair: list[xr.Dataset]) -> None:
 
 def test_a_model_of_one_warm_up_is_usable_at_other_speeds(warm_up: Callable[..., xr.Dataset]) -> None:
     """A validation by blocks alone would select a model with 10 features and U = 17 um."""
-    model = fit([warm_up(29, 0).isel(time=slice(None, None, 2))], Settings(variant="dynamics"))
+    model = fit([warm_up(29, 0).isel(time=slice(None, None, 2))], ThermalModelSettings(variant="dynamics"))
     covariance = model.predict(warm_up(29, 2))["covariance"].values[:, :3, :3]
     assert 2 * np.sqrt(np.einsum("tii->ti", covariance).max()) < Limits().uncertainty / 2
 
@@ -180,7 +180,7 @@ def test_a_model_of_one_warm_up_uses_a_sensor_that_shows_the_heat(
     warm_up: Callable[..., xr.Dataset], keep: int
 ) -> None:
     """A validation by blocks would select only the speed on this machine, whatever the first sensor shows."""
-    settings = Settings(variant="dynamics", time_constants=("30 min",))
+    settings = ThermalModelSettings(variant="dynamics", time_constants=("30 min",))
     one = of_noise(warm_up(3, 0), keep)
     assert fit([one], settings).sensors == tuple(map(str, one["sensor"].values[:keep]))
 
@@ -200,7 +200,7 @@ def test_incompatible_campaigns_are_an_error(pair: list[xr.Dataset]) -> None:
     with pytest.raises(DatasetError, match=f"at least {MIN_SAMPLES} known values"):
         fit([first.isel(time=slice(0, 4))])
     with pytest.raises(DatasetError, match=r"sensors: expected sensors of all campaigns .*; found nose"):
-        fit(pair, Settings(sensors=("nose",)))
+        fit(pair, ThermalModelSettings(sensors=("nose",)))
 
 
 def test_a_repeated_campaign_is_an_error(pair: list[xr.Dataset]) -> None:
@@ -212,12 +212,12 @@ def test_a_sensor_unknown_in_one_campaign_is_not_used(pair: list[xr.Dataset]) ->
     """A broken sensor is NaN throughout. If all are, the campaign is an error."""
     deaf = pair[1].copy(deep=True)
     deaf["temperature"].loc[{"sensor": "head"}] = np.nan
-    model = fit([pair[0], deaf], Settings(variant="lagged", most_sensors=2))
+    model = fit([pair[0], deaf], ThermalModelSettings(variant="lagged", most_sensors=2))
     assert len(model.sensors) == 2
     assert "head" not in model.sensors
     deaf["temperature"][:] = np.nan
     with raises("model.sensors.none"):
-        fit([pair[0], deaf], Settings(variant="lagged"))
+        fit([pair[0], deaf], ThermalModelSettings(variant="lagged"))
 
 
 def test_a_check_requires_the_same_component(model: ThermalModel, pair: list[xr.Dataset]) -> None:

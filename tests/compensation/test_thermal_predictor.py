@@ -8,13 +8,13 @@ import xarray as xr
 from coded import raises
 
 from errormotion.compensation.online.prediction import Prediction, Predictor, predictor
-from errormotion.compensation.thermal_model import Settings, ThermalModel, fit
+from errormotion.compensation.thermal_model import ThermalModel, ThermalModelSettings, fit
 from errormotion.datasets.schemas import DOF
 from errormotion.errors import CompensationError
 
 VARIANTS = {
-    "lagged": Settings(variant="lagged", lags=("10 min",)),
-    "dynamics": Settings(variant="dynamics", time_constants=("30 min",)),
+    "lagged": ThermalModelSettings(variant="lagged", lags=("10 min",)),
+    "dynamics": ThermalModelSettings(variant="dynamics", time_constants=("30 min",)),
 }
 
 

@@ -15,7 +15,7 @@ from errormotion.campaign.compensation.compensating import Compensation
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.campaign.folder import RunFolder
 from errormotion.cli.demo import spindle as demonstration
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.datasets import load
 from errormotion.twin import Event, VirtualMachine
 
@@ -270,7 +270,7 @@ def _compensating(folder: Path) -> Iterator[Path]:
         warm_ups.append(
             warm_up.assign(temperature=warm_up["temperature"] + rng.normal(0.0, NOISE, warm_up["temperature"].shape))
         )
-    fit(warm_ups, Settings(variant="lagged", sensors=SENSORS)).save(folder / "model.nc")
+    fit(warm_ups, ThermalModelSettings(variant="lagged", sensors=SENSORS)).save(folder / "model.nc")
     (folder / "plc.toml").write_text(COMPENSATED)
     bench, model = load_bench(folder / "plc.toml"), load(folder / "model.nc")
     compensation = Compensation(bench, model, folder / "runs", arm="C-frame 610")

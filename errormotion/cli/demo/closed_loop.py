@@ -18,8 +18,7 @@ from errormotion.compensation.effect import Effect, effect
 from errormotion.compensation.online.prediction import predictor
 from errormotion.compensation.online.rehearsal import Rehearsal, rehearse
 from errormotion.compensation.online.settings import Limits
-from errormotion.compensation.thermal_model import Settings as ModelSettings
-from errormotion.compensation.thermal_model import ThermalModel, fit
+from errormotion.compensation.thermal_model import ThermalModel, ThermalModelSettings, fit
 from errormotion.twin import Event, VirtualMachine
 
 METHOD = "normal_vector"
@@ -32,7 +31,7 @@ TRUTH_STEP = 60.0
 MIN_RISE = 1.0
 """Smallest change of a temperature in the training for the use of its sensor, K; it excludes noise and air."""
 
-SMALL = ModelSettings(variant="dynamics", most_sensors=2, time_constants=(600.0, 3600.0))
+SMALL = ThermalModelSettings(variant="dynamics", most_sensors=2, time_constants=(600.0, 3600.0))
 """At most 10 features: the 19 cycles of one warm-up do not determine more, and the prediction of a larger model at
 other speeds would be too uncertain to be used."""
 
@@ -52,7 +51,7 @@ class Duty:
         Duration of a cycle, s. The spindle starts after the first one.
     limits : Limits
         Limits of the compensation.
-    model : ModelSettings
+    model : ThermalModelSettings
         Settings of the fit; default: `SMALL`.
     """
 
@@ -60,7 +59,7 @@ class Duty:
     interval: float = 600.0
     cycle: float = 120.0
     limits: Limits = field(default_factory=Limits)
-    model: ModelSettings = SMALL
+    model: ThermalModelSettings = SMALL
 
     @property
     def cycles(self) -> Array:

@@ -25,11 +25,11 @@ from errormotion.cli.demo.closed_loop import with_warm_sensors
 from errormotion.cli.output import show, show_json, table
 from errormotion.compensation.effect import effect
 from errormotion.compensation.effect.text import HEAD, rows, verdict
-from errormotion.compensation.thermal_model import Settings, fit
+from errormotion.compensation.thermal_model import ThermalModelSettings, fit
 from errormotion.errors import ErrormotionError
 
 CAMPAIGN = Path(__file__).parent / "linuxcnc" / "compensated.toml"
-MODEL = Settings(variant="lagged", lags=())
+MODEL = ThermalModelSettings(variant="lagged", lags=())
 """Present temperatures only: the compensation would evaluate lags in real time, which differs from simulated time."""
 RAMP_TIMEOUT = 15.0
 """Time within which the offset is zero after the second warm-up, s."""

@@ -5,7 +5,7 @@ interpreter of LinuxCNC if it is installed, adds the correction to every command
 as the tolerance requires. A line that neither reader supports raises an error with its number.
 """
 
-from errormotion.compensation.program.compensating import Outcome, Settings, compensate
+from errormotion.compensation.program.compensating import Outcome, ProgramSettings, compensate
 from errormotion.compensation.program.reading.items import UNCHANGED
 from errormotion.compensation.program.reading.offsets import Offsets, read_parameters, read_tools
 from errormotion.compensation.program.reading.reader import Reader
@@ -17,9 +17,9 @@ __all__ = [
     "ByTool",
     "Offsets",
     "Outcome",
+    "ProgramSettings",
     "Reader",
     "Rewriting",
-    "Settings",
     "Summary",
     "compensate",
     "read_parameters",

@@ -37,7 +37,7 @@ _SUBROUTINE = re.compile(r"\s*/?\s*(?:[nN]\s*\d+\s*)?[oO]")
 
 
 @dataclass(frozen=True)
-class Settings:
+class ProgramSettings:
     """Settings of the reading and correction of a program.
 
     Attributes
@@ -97,7 +97,7 @@ def compensate(
     out: Path,
     correcting: Correcting,
     offsets: Offsets,
-    settings: Settings | None = None,
+    settings: ProgramSettings | None = None,
     *,
     head: Sequence[str] = (),
 ) -> Outcome:
@@ -110,7 +110,7 @@ def compensate(
     correcting : callable
     offsets : Offsets
         Offsets of the control before the program starts.
-    settings : Settings, optional
+    settings : ProgramSettings, optional
     head : sequence of str
         Comments at the start of the new program.
 
@@ -119,7 +119,7 @@ def compensate(
     ProgramError
         A line is not supported by any of the readers, or its effect is not determined. Then no file is written.
     """
-    chosen = settings or Settings()
+    chosen = settings or ProgramSettings()
     if chosen.route not in ROUTES:
         raise ProgramError(
             f"reader '{chosen.route}': expected one of {', '.join(ROUTES)}", code="program.reader.unknown"
@@ -148,7 +148,7 @@ def compensate(
             raise ProgramError(f"{error}" + (f"\nThe plain reader: {why}" if why else ""), code=error.code) from error
 
 
-def _expanded(source: list[str], expansion: Expansion, offsets: Offsets, settings: Settings) -> Generator[str]:
+def _expanded(source: list[str], expansion: Expansion, offsets: Offsets, settings: ProgramSettings) -> Generator[str]:
     with closing(canonical.commands(source, offsets, deleted=settings.deleted)) as commands:
         yield from expansion.lines(commands)
 
@@ -159,7 +159,7 @@ def _written(
     beside: Path,
     correcting: Correcting,
     offsets: Offsets,
-    settings: Settings,
+    settings: ProgramSettings,
     head: Sequence[str],
     why: str,
 ) -> Outcome:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
-from errormotion.compensation.program.compensating import Outcome, Settings
+from errormotion.compensation.program.compensating import Outcome, ProgramSettings
 from errormotion.compensation.program.reading.items import UNCHANGED
 from errormotion.compensation.program.writing.rewriting import Summary
 from errormotion.report import Form, canvas, provenance, write_page
@@ -29,7 +29,7 @@ def write_program_report(
     out: Path,
     errors: xr.Dataset,
     outcome: Outcome,
-    settings: Settings,
+    settings: ProgramSettings,
     *,
     program: str,
     uncertainty: Array | None = None,
@@ -45,7 +45,7 @@ def write_program_report(
     errors : Dataset
         Errors that the correction is based on, for the head of the page.
     outcome : Outcome
-    settings : Settings
+    settings : ProgramSettings
     program : str
         Name of the program.
     uncertainty : array (n, 3), optional
@@ -77,7 +77,7 @@ def texts(language: str) -> dict[str, str]:
 
 
 def _part(
-    outcome: Outcome, settings: Settings, program: str, uncertainty: Array | None, notes: tuple[str, ...]
+    outcome: Outcome, settings: ProgramSettings, program: str, uncertainty: Array | None, notes: tuple[str, ...]
 ) -> Part:
     found = outcome.summary
     largest = np.abs(found.offsets).max(axis=0) if len(found.offsets) else np.zeros(3)
@@ -122,7 +122,7 @@ def _part(
     )
 
 
-def _summary(outcome: Outcome, settings: Settings) -> list[str]:
+def _summary(outcome: Outcome, settings: ProgramSettings) -> list[str]:
     found = outcome.summary
     words = [
         f"Cuts follow the corrected path to {significant(1e6 * settings.tolerance, 2)} µm and the last printed digit.",
@@ -152,7 +152,7 @@ def _left(outcome: Outcome) -> list[Block]:
     return [Table("Moves without correction.", ["kind", "number", "first line"], rows, numeric=False)]
 
 
-def _reading(outcome: Outcome, settings: Settings) -> list[Block]:
+def _reading(outcome: Outcome, settings: ProgramSettings) -> list[Block]:
     reader = "the plain reader" if outcome.route == "plain" else "LinuxCNC's interpreter, which expanded it"
     rows: list[list[Cell | str]] = [
         ["read by", reader],

@@ -7,6 +7,6 @@ uncertainty of the prediction, and is stored as a dataset (schema ``errormotion.
 from errormotion.compensation.thermal_model.check import Check, check
 from errormotion.compensation.thermal_model.fitting import fit
 from errormotion.compensation.thermal_model.model import SCHEMA, ThermalModel
-from errormotion.compensation.thermal_model.settings import Settings
+from errormotion.compensation.thermal_model.settings import ThermalModelSettings
 
-__all__ = ["SCHEMA", "Check", "Settings", "ThermalModel", "check", "fit"]
+__all__ = ["SCHEMA", "Check", "ThermalModel", "ThermalModelSettings", "check", "fit"]

@@ -19,7 +19,7 @@ from errormotion.compensation.thermal_model import training
 from errormotion.compensation.thermal_model.features import Feature, dynamics, lagged
 from errormotion.compensation.thermal_model.model import Parts, ThermalModel
 from errormotion.compensation.thermal_model.record import instruments_of, read_record
-from errormotion.compensation.thermal_model.settings import Settings
+from errormotion.compensation.thermal_model.settings import ThermalModelSettings
 from errormotion.datasets import provenance
 from errormotion.errors import DatasetError
 from errormotion.estimation import ridge
@@ -69,7 +69,7 @@ class Candidate:
     score: float
 
 
-def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> ThermalModel:
+def fit(campaigns: Sequence[xr.Dataset], settings: ThermalModelSettings | None = None) -> ThermalModel:
     """Fit a thermal model to measured warm-ups.
 
     Parameters
@@ -77,7 +77,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     campaigns : sequence of Dataset
         Error datasets over time with ``temperature(time, sensor)``; two or more for a valid uncertainty. For a single
         one, blocks in time replace the campaigns, and the model states this.
-    settings : Settings, optional
+    settings : ThermalModelSettings, optional
 
     Returns
     -------
@@ -93,7 +93,7 @@ def fit(campaigns: Sequence[xr.Dataset], settings: Settings | None = None) -> Th
     -----
     The model of an error is NaN if fewer than `MIN_SAMPLES` values are known, or only one of several campaigns has any.
     """
-    settings = settings or Settings()
+    settings = settings or ThermalModelSettings()
     if not campaigns:
         raise DatasetError("Expected the errors of at least one campaign; found none.", code="model.no_campaigns")
     _check_size(campaigns)
@@ -159,7 +159,9 @@ def _check_alike(campaigns: Sequence[xr.Dataset]) -> None:
             )
 
 
-def _chosen(columns: training.Columns, seen: Sequence[int], settings: Settings) -> tuple[Candidate, list[Candidate]]:
+def _chosen(
+    columns: training.Columns, seen: Sequence[int], settings: ThermalModelSettings
+) -> tuple[Candidate, list[Candidate]]:
     """Return the best candidate, and the best candidates of all variants and constants."""
     records = columns.records
     temperatures = [r.inputs.temperature for r in records]
@@ -211,7 +213,7 @@ def _with_sensors(
     constants: tuple[float, ...],
     common: Sequence[str],
     parameters: tuple[str, ...],
-    settings: Settings,
+    settings: ThermalModelSettings,
 ) -> Candidate | None:
     """Return the candidate with the given sensors, or with sensors added one by one while the error decreases."""
 
@@ -272,7 +274,7 @@ def _made(
     seen: Sequence[int],
     best: Candidate,
     tried: Sequence[Candidate],
-    settings: Settings,
+    settings: ThermalModelSettings,
 ) -> ThermalModel:
     X, scale = columns.of(best.features)
     group = training.groups(columns.records)

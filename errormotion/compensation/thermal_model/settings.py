@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from errormotion.datasets.units import Time
 
 
-class Settings(BaseModel):
+class ThermalModelSettings(BaseModel):
     """Settings of the fit; those not given are selected by cross-validation over campaigns."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -13,7 +13,7 @@ from nc_controls import Reading, control
 from nc_paths import ORIGINS, field, rewritten
 from nc_programs import Programs
 
-from errormotion.compensation.program.compensating import Settings, compensate
+from errormotion.compensation.program.compensating import ProgramSettings, compensate
 from errormotion.compensation.program.interpreter import canonical, paths
 from errormotion.compensation.program.interpreter.agreement import check
 from errormotion.compensation.program.interpreter.expanding import Expansion
@@ -54,7 +54,7 @@ def test_the_new_program_cuts_as_the_original_on_its_machine(lines: list[str], u
     program = tmp_path / "a.ngc"
     head = HEAD if unit == "mm" or lines is COMPENSATED else [HEAD[0].replace("G21", "G20"), *HEAD[1:]]
     program.write_text("\n".join([*head, *lines, "M2"]))
-    settings = Settings(check=True, tolerance=5e-6)
+    settings = ProgramSettings(check=True, tolerance=5e-6)
     lengths = machine(tmp_path, unit)
     if unit == "inch" and lines is COMPENSATED:
         lengths = replace(lengths, cutters={2: Cutter(4e-3)}, table="")
@@ -84,7 +84,7 @@ def test_a_wrong_state_of_the_control_in_the_expansion_is_found(
     program = tmp_path / "a.ngc"
     program.write_text("\n".join([*HEAD, *COMPENSATED, *READING, "M2"]))
     with pytest.raises(ProgramError, match=r"check of the new program: .*the original cuts to .*as LinuxCNC reads it"):
-        compensate(program, tmp_path / "b.ngc", bent, offsets, Settings(check=True))
+        compensate(program, tmp_path / "b.ngc", bent, offsets, ProgramSettings(check=True))
     assert not (tmp_path / "b.ngc").exists()
 
 

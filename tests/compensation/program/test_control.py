@@ -10,7 +10,7 @@ import pytest
 from coded import raises
 from nc_paths import moves_of, zero
 
-from errormotion.compensation.program.compensating import Settings, compensate
+from errormotion.compensation.program.compensating import ProgramSettings, compensate
 from errormotion.compensation.program.interpreter import canonical
 from errormotion.compensation.program.interpreter.expanding import Expansion
 from errormotion.compensation.program.reading.items import LINE
@@ -123,7 +123,7 @@ def test_a_value_that_nothing_states_is_refused_by_name(lines: list[str], name: 
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2", ""]))
     with pytest.raises(ProgramError) as error:
-        compensate(program, out, zero, stated(tmp_path), Settings(route="interpreter"))
+        compensate(program, out, zero, stated(tmp_path), ProgramSettings(route="interpreter"))
     message = str(error.value).split(":", 1)[1]
     assert name.lower() in message.lower()
     assert not out.exists()
@@ -181,7 +181,7 @@ def test_the_interpreter_restores_the_stored_offset_as_well(tmp_path: Path) -> N
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*lines, ""]))
     with pytest.raises(ProgramError, match=r"restores an offset of G92"):
-        compensate(program, out, zero, stated(tmp_path), Settings(route="interpreter"))
+        compensate(program, out, zero, stated(tmp_path), ProgramSettings(route="interpreter"))
     assert not out.exists()
 
 
@@ -206,7 +206,7 @@ def test_g28_before_any_position_is_expanded(words: str, tmp_path: Path) -> None
 def test_parameters_that_the_control_keeps_and_the_new_program_does_not_set_are_noted(tmp_path: Path) -> None:
     program = tmp_path / "a.ngc"
     program.write_text("\n".join([*HEAD, "#150=3 #32=4", "G1 X[#150+#32]", "M2"]))
-    found = compensate(program, tmp_path / "b.ngc", zero, control(tmp_path), Settings())
+    found = compensate(program, tmp_path / "b.ngc", zero, control(tmp_path), ProgramSettings())
     assert found.notes == ("the new program does not set #150, which the parameter file keeps for other programs",)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from nc_paths import ORIGINS, field, moves_of, zero
 
-from errormotion.compensation.program.compensating import Outcome, Settings, compensate
+from errormotion.compensation.program.compensating import Outcome, ProgramSettings, compensate
 from errormotion.compensation.program.interpreter import canonical
 from errormotion.compensation.program.interpreter.agreement import check
 from errormotion.compensation.program.reading.reader import Reader
@@ -24,7 +24,7 @@ def written(folder: Path, text: str | bytes, **settings: object) -> tuple[Outcom
     """Return the outcome and the new lines of a program."""
     program, out = folder / "a.ngc", folder / "b.ngc"
     program.write_bytes(text if isinstance(text, bytes) else text.encode())
-    outcome = compensate(program, out, shift, ORIGINS, Settings(**settings), head=["head"])
+    outcome = compensate(program, out, shift, ORIGINS, ProgramSettings(**settings), head=["head"])
     return outcome, out.read_text(encoding="utf-8").splitlines()
 
 
@@ -112,7 +112,7 @@ def test_a_message_on_an_expanded_program_has_the_line_of_the_program(
     program = tmp_path / "a.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]))
     with pytest.raises(ProgramError) as error:
-        compensate(program, tmp_path / "b.ngc", zero, ORIGINS, Settings(route="interpreter"))
+        compensate(program, tmp_path / "b.ngc", zero, ORIGINS, ProgramSettings(route="interpreter"))
     assert str(error.value).startswith(f"line {number} '{[*HEAD, *lines][number - 1]}': ")
 
 
@@ -121,5 +121,5 @@ def test_the_lines_of_an_expanded_program_are_those_of_the_program(tmp_path: Pat
     bent = field(lambda p: p * 1e-3)
     program = tmp_path / "a.ngc"
     program.write_text("\n".join([*HEAD, "F100", "#1=2", "G1 X[#1]", "", "G1 X[50*#1] (longest)", "G1 X0", "M2"]))
-    found = compensate(program, tmp_path / "b.ngc", bent, ORIGINS, Settings(route="interpreter"))
+    found = compensate(program, tmp_path / "b.ngc", bent, ORIGINS, ProgramSettings(route="interpreter"))
     assert found.summary.largest_line == 7

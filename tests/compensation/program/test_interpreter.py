@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from nc_paths import ORIGINS, field, moves_of, rewritten, zero
 from nc_programs import Programs
 
-from errormotion.compensation.program.compensating import Settings, compensate
+from errormotion.compensation.program.compensating import ProgramSettings, compensate
 from errormotion.compensation.program.interpreter import canonical
 from errormotion.compensation.program.interpreter.agreement import check
 from errormotion.compensation.program.interpreter.expanding import Expansion
@@ -136,7 +136,7 @@ def test_a_program_that_neither_reader_supports_is_an_error(
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_text("\n".join([*HEAD, *lines, "M2"]) + "\n")
     with pytest.raises(ProgramError, match=why):
-        compensate(program, out, zero, ORIGINS, Settings(route="interpreter"))
+        compensate(program, out, zero, ORIGINS, ProgramSettings(route="interpreter"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.ngc"]
 
 
@@ -180,7 +180,7 @@ def test_the_first_moves_name_only_the_axes_of_the_program() -> None:
 def test_the_route_is_selected_and_reported(tmp_path: Path) -> None:
     program, out = tmp_path / "a.ngc", tmp_path / "b.ngc"
     program.write_bytes("\r\n".join(["%", *HEAD, "#1=50", "G1 X#1 Y30", "M2", "%", ""]).encode())
-    found = compensate(program, out, bent, ORIGINS, Settings(check=True), head=["machine (test) ü"])
+    found = compensate(program, out, bent, ORIGINS, ProgramSettings(check=True), head=["machine (test) ü"])
     assert found.route == "interpreter"
     assert "line 5" in found.why
     assert found.checked == found.summary.written - len([x for x in out.read_text().splitlines() if "X" not in x]) + 1

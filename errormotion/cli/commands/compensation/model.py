@@ -14,7 +14,7 @@ from errormotion.cli.output import show, show_json, table
 from errormotion.cli.page import Page, new_dataset
 from errormotion.cli.progress import Bars
 from errormotion.compensation.thermal_model import SCHEMA as MODEL_SCHEMA
-from errormotion.compensation.thermal_model import Check, Settings, ThermalModel, check, fit
+from errormotion.compensation.thermal_model import Check, ThermalModel, ThermalModelSettings, check, fit
 from errormotion.datasets.schemas import DOF, SCHEMA
 from errormotion.datasets.storage.disk import reading
 from errormotion.datasets.validation import explained
@@ -32,7 +32,7 @@ def make(campaigns: list[Path], out: Path, assignments: list[str], settings_file
         The errors cannot be read or do not determine a model, or the file already exists.
     """
     new_dataset(out)
-    settings = read_settings(Settings, settings_file, assignments)
+    settings = read_settings(ThermalModelSettings, settings_file, assignments)
     with Bars(as_json) as bars:
         bars.stage("fitting")
         with reading(", ".join(map(str, campaigns))):

@@ -17,7 +17,7 @@ from errormotion.cli.options import quantity
 from errormotion.cli.output import show, show_json
 from errormotion.cli.page import Page
 from errormotion.compensation.correction import Correction, correction
-from errormotion.compensation.program import UNCHANGED, ByTool, Offsets, Outcome, Settings, compensate
+from errormotion.compensation.program import UNCHANGED, ByTool, Offsets, Outcome, ProgramSettings, compensate
 from errormotion.compensation.program.reading.offsets import read_parameters
 from errormotion.compensation.program.reading.tools import read_table
 from errormotion.datasets.storage.disk import reading
@@ -61,7 +61,7 @@ def program(part: Path, sources: list[Path], choice: Choice, out: Path | None, a
     target = out or part.with_name(f"{part.stem}.corrected{part.suffix}")
     if target.exists():
         raise ProgramError(f"{target}: already exists, and is not replaced; give another name", code="file.exists")
-    settings = Settings(
+    settings = ProgramSettings(
         tolerance=quantity("--tolerance", choice.tolerance, Length),
         step=quantity("--sampling", choice.sampling, Length),
         unit=_one_of("--unit", choice.unit, ("mm", "inch")),
@@ -136,7 +136,7 @@ def _offsets(choice: Choice) -> Offsets:
 
 
 def _head(
-    part: Path, sources: list[Path], errors: list[xr.Dataset], settings: Settings, time: float | None
+    part: Path, sources: list[Path], errors: list[xr.Dataset], settings: ProgramSettings, time: float | None
 ) -> list[str]:
     lines = [f"{part.name}, corrected by errormotion {errormotion.__version__}"]
     for path, ds in zip(sources, errors, strict=True):

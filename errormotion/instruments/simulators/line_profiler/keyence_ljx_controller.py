@@ -63,7 +63,7 @@ class Controller:
         self.errors: list[int] = []
         self._measuring, self._connected = measuring, connected
         self._serial, self._points, self._kind, self._x_pitch = serial, points, kind, x_pitch
-        self._settings = settings.Settings(delivered)
+        self._settings = settings.SettingLevels(delivered)
         self._program = self._timer = 0
         self._prepared: tuple[ProfileLayout, int] | None = None
         self._cleared_since = False

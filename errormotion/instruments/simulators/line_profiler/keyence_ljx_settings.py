@@ -26,7 +26,7 @@ Target = tuple[int, int, int, bytes]
 """Type, category, item, and four bytes that specify the item."""
 
 
-class Settings:
+class SettingLevels:
     """The settings on their three levels.
 
     A block of category FF and the items are stored separately: the layout of the block is not documented.

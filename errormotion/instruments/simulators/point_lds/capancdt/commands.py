@@ -65,7 +65,7 @@ class MathFunction:
 
 
 @dataclass
-class Settings:
+class ControllerMemory:
     """Settings of the controller as delivered."""
 
     sample_time: int = 256
@@ -82,7 +82,7 @@ class Settings:
 class Controller(Protocol):
     """The part of the controller that the commands use; its sensors are numbered from 1 to 4."""
 
-    settings: Settings
+    settings: ControllerMemory
     sensors: Mapping[int, Sensor]
     serial: int
     port: int

@@ -14,8 +14,8 @@ from errormotion.instruments.simulators.point_lds.capancdt.commands import (
     CHANNELS,
     FULL_SCALE,
     TIME_OUT,
+    ControllerMemory,
     Sensor,
-    Settings,
     answer,
 )
 from errormotion.instruments.simulators.point_lds.capancdt.frames import (
@@ -87,7 +87,7 @@ class SimulatedCapaNCDT(DataPortDevice):
             channel: Sensor(beams[channel - 1], length, 100 * self.serial + channel)
             for channel, length in zip(channels, ranges, strict=True)
         }
-        self.settings = Settings(password=address.params.get("password", ""))
+        self.settings = ControllerMemory(password=address.params.get("password", ""))
         self._time_limit = address.number("time_limit", TIME_LIMIT)
         self._greeting = address.params.get("greeting", GREETING)
         self._frames = max(1, int(address.number("frames", FRAMES_PER_BLOCK)))

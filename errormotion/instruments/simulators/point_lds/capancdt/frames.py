@@ -12,7 +12,7 @@ from errormotion.instruments.simulators.point_lds.capancdt.commands import (
     CHANNELS,
     FULL_SCALE,
     ORDER_NUMBER,
-    Settings,
+    ControllerMemory,
 )
 
 Array = np.ndarray[Any, Any]
@@ -59,7 +59,7 @@ def _whole(values: Array) -> Array:
     return np.asarray(np.rint(values), dtype=np.int64)
 
 
-def with_functions(frames: Array, present: Sequence[int], settings: Settings) -> tuple[Array, tuple[int, ...]]:
+def with_functions(frames: Array, present: Sequence[int], settings: ControllerMemory) -> tuple[Array, tuple[int, ...]]:
     """Return the values of all channels that are sent, shape (frame, channel), and their numbers.
 
     ``frames`` contains the channels that are ``present``; a math function replaces its channel.
