@@ -115,9 +115,10 @@ class Fit:
         n, m = linear.used.shape
         found = np.zeros((n, m, m))
         # J C J' = J_L own J_L' + E E' with E = (J_B - J_L F) root
+        shared = normal.shared
         for first in range(0, n, _ROWS):
             rows = np.arange(first, min(first + _ROWS, n))
-            E = linear.effect(normal.shared, normal.root, rows)
+            E = linear.effect(shared, normal.root, rows)
             found[rows] = E @ np.swapaxes(E, 1, 2)
         if linear.numbering.local is not None:
             found += self._local_hat()
