@@ -31,9 +31,8 @@ from scipy.stats import norm
 
 from benchmarks.multilateration_published import alternate, fitted, jacobian, relative_bound
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.model import Stations, directions, readings
-from errormotion.methods.multilateration.network.solver import solve
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.networks import bound, solve, station_covariance
+from errormotion.methods.multilateration.start import Stations, directions, readings
 
 PARTS = ("compare", "coverage", "layout")
 NOISE = 1e-6
@@ -68,20 +67,20 @@ def on_nominal(target, station, nominal):
 
 def ours(u, d, station):
     network = solve(d, u, station, noise=NOISE, robust=False)
-    return network.target, network.station, 0, True
+    return network.target, network.stations.position, 0, True
 
 
 def ours_checked(u, d, station):
     network = solve(d, u, station, noise=NOISE)
-    return network.target, network.station, 0, True
+    return network.target, network.stations.position, 0, True
 
 
 def ours_in_full(u, d, station):
     network = solve(d, u, station, noise=NOISE)
-    assert network.target_covariance.shape == (len(u), 3, 3)
-    assert network.joint_covariance.shape == (16, 16)
+    assert network.covariance.shape == (len(u), 3, 3)
+    assert station_covariance(network.solved).shape == (16, 16)
     assert network.redundancy.shape == network.residual.shape == d.shape
-    return network.target, network.station, 0, True
+    return network.target, network.stations.position, 0, True
 
 
 def unpacked(x, m):
@@ -276,7 +275,7 @@ def coverage(seeds: int = 300) -> None:
     wide = np.sqrt(np.trace(truth.station_covariance, axis1=1, axis2=2)).max()
     print(f"largest standard uncertainty of a station {wide * 1e6:.0f} um: linear to {wide / 0.2:.0e} of its distance")
     for name, noise, expected, expected_stations in (
-        ("dead paths free", NOISE, truth.target_covariance, truth.station_covariance),
+        ("dead paths free", NOISE, truth.covariance, truth.station_covariance),
         ("relative to target 1", relative_noise, covariance, np.full((4, 3, 3), np.nan)),
     ):
         targets, stations, inside, inside_stations, given_up = [], [], [], [], 0
@@ -285,12 +284,12 @@ def coverage(seeds: int = 300) -> None:
             network = solve(d, u, STATION, noise=noise, robust=noise is NOISE)
             k = norm.isf(0.025)
             targets.append(network.target - u)
-            stations.append(network.station - STATION)
-            ratio = np.abs(targets[-1]) / sigma(network.target_covariance)
+            stations.append(network.stations.position - STATION)
+            ratio = np.abs(targets[-1]) / sigma(network.covariance)
             given_up += len(network.undecided)
             inside.append(np.where(np.isfinite(ratio), ratio < k, np.nan))
             inside_stations.append(np.abs(stations[-1]) < k * sigma(network.station_covariance))
-        best = np.sqrt(np.trace(truth.target_covariance, axis1=1, axis2=2).mean())
+        best = np.sqrt(np.trace(truth.covariance, axis1=1, axis2=2).mean())
         best_station = np.sqrt(np.trace(truth.station_covariance, axis1=1, axis2=2).mean())
         spread = np.sqrt(np.nanmean(np.sum(np.square(targets), axis=-1)))
         spread_stations = np.sqrt(np.mean(np.sum(np.square(stations), axis=-1)))
@@ -304,7 +303,7 @@ def coverage(seeds: int = 300) -> None:
             f"{'':>22}  stations coverage {np.mean(inside_stations):.2%}, spread {spread_stations * 1e6:.2f} um = "
             f"{spread_stations / best_station:.3f} of the bound ({own_stations / best_station:.3f} expected)"
         )
-    said = np.sqrt(np.trace(stated.target_covariance, axis1=1, axis2=2).mean())
+    said = np.sqrt(np.trace(stated.covariance, axis1=1, axis2=2).mean())
     print(f"{'':>22}  the relative formulation itself states {said * 1e6:.3f} um")
 
 
@@ -368,7 +367,7 @@ def layout(draws: int = 200) -> None:
         except MethodError as error:
             print(f"{name:>32} {str(error).split('What is special: ')[-1]}")
             continue
-        axes = np.sqrt(np.diagonal(network.target_covariance, axis1=1, axis2=2).mean(axis=0)) * 1e6
+        axes = np.sqrt(np.diagonal(network.covariance, axis1=1, axis2=2).mean(axis=0)) * 1e6
         worst_station = np.sqrt(np.trace(network.station_covariance, axis1=1, axis2=2)).max() * 1e6
         each = network.uncertainty * 1e6
         print(

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from errormotion.methods.multilateration.network.model import directions
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.networks import bound
+from errormotion.methods.multilateration.start import directions
 
 NOISE = 1e-6
 OVERHEAD = (0.05, 0.05, 0.45)

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.model import Shared, Sources, Stations, directions
-from errormotion.methods.multilateration.network.network import Network
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.model import Shared, Sources
+from errormotion.methods.multilateration.networks import Network, bound
+from errormotion.methods.multilateration.start import Stations, directions
 
 TOLERANCE = 1e-9
 _HALF_STEPS = 2
@@ -156,7 +156,7 @@ def relative_bound(target: Array, station: Array, *, noise: float, first: int = 
     changes[np.arange(len(station)), np.arange(len(station)), first] = noise
     sources = Sources(scales=[Shared(f"station {j + 1}", "first target", each) for j, each in enumerate(changes)])
     stated = bound(target, station, noise=sd, sources=sources)
-    return stated.moved.errors.covariance, stated
+    return stated.solved.relative.errors.covariance, stated
 
 
 def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.csr_array:

@@ -13,8 +13,8 @@ from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import move, rigid_motions
 from errormotion.kinematics.volumes import AxisErrors, Targets, Volume, first_order, fitted, is_rotation
 from errormotion.methods.multilateration import Multilateration, Settings, simulation
-from errormotion.methods.multilateration.identification.volume import grid, volumetric_errors
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.axes import grid, volumetric_errors
+from errormotion.methods.multilateration.networks import bound
 from errormotion.methods.multilateration.simulation import NOISE, REFLECTOR
 from errormotion.twin import VirtualMachine
 
@@ -70,7 +70,7 @@ def honesty(seeds: int) -> list[str]:
         least = bound(place, station, noise=NOISE)
         # The scale is one draw for all, added to the bound of the noise.
         stretch = SCALE * (place - place.mean(axis=0))
-        spread.append(left / np.sqrt(np.einsum("tii->ti", least.target_covariance) + stretch**2))
+        spread.append(left / np.sqrt(np.einsum("tii->ti", least.covariance) + stretch**2))
         off = errors["station_place"].values - true_station
         away = SCALE * (station - place.mean(axis=0))
         u = np.sqrt(np.einsum("sii->si", errors["station_covariance"].values) + away**2)
@@ -78,7 +78,7 @@ def honesty(seeds: int) -> list[str]:
         station_spread.append(off / np.sqrt(np.einsum("sii->si", least.station_covariance) + away**2))
     ratio = [np.sqrt(np.nanmean(np.square(part))) for part in (spread, station_spread)]
     held = [np.mean(np.abs(part)[np.isfinite(part)] <= Z95) for part in (z, station_z)]
-    least_u = np.sqrt(np.mean(np.einsum("tii->ti", least.target_covariance), axis=0)) * 1e6
+    least_u = np.sqrt(np.mean(np.einsum("tii->ti", least.covariance), axis=0)) * 1e6
     return [
         f"{seeds} virtual machines, each with its own errors and tracker: {np.prod(COUNT)} targets, four successive "
         f"positions of one tracker, {NOISE * 1e6:.2g} um noise of a reading, free dead paths, an error of lengths of "

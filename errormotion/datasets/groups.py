@@ -54,6 +54,7 @@ GROUPS = {
     "sensor direction": "directions of the sensors",
     "sensor gain": "relative errors of the readings of sensors",
     "stations": "positions and zero points of the stations of a tracker",
+    "targets": "targets that define the datum of a network, by the noise of their readings",
     "temperature of the bar": "temperature of a ballbar",
     "trend over the test": "change with time that the runs of a test have in common",
     "triangulation plane": "rotation of the triangulation plane of a point sensor about its beam",

@@ -194,11 +194,15 @@ class Noise:
         In place of ``sd``: a square root of the covariance of each reading with r numbers.
     stated : bool
         Whether the size is known; otherwise only the ratios are, and the residuals give the size.
+    freedom : float
+        Degrees of freedom of a stated variance (GUM G.4.2): ``1/2 (u(s) / s)^-2``. If finite, it is combined with that
+        of the residuals as long as they agree.
     """
 
     sd: Array | None = None
     root: Array | None = None
     stated: bool = True
+    freedom: float = np.inf
 
     def __post_init__(self) -> None:
         if (self.sd is None) == (self.root is None):

@@ -172,6 +172,9 @@ def fit(
         unit = _unit(linear)
         step, decrement = _step(linear, normal)
         linear = _descended(linear, step)
+        if problem.settled is not None:  # along the gauge, which changes no residual
+            its = list(problem.settled(problem, type(problem.unknowns)(*linear.at.tables)))
+            linear = replace(linear, at=replace(linear.at, tables=its))
         at = linear.at
         if refresh is not None:
             problem = refresh(problem, type(problem.unknowns)(*at.tables))

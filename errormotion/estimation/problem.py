@@ -55,6 +55,10 @@ class Problem:
     linear : bool
         Whether the derivatives, and the effect of the noise on the residuals, do not depend on the unknowns: they are
         computed once, and one step solves the problem.
+    settled : callable, optional
+        ``settled(problem, x)`` returns the tables of unknowns that are preferred among those which differ along the
+        gauge only, such as a network moved to its nominal positions. It is applied after each step of a fit, since the
+        gauge is linear and a motion is not.
     """
 
     equation: Callable[[Array, Any, Any], Array]
@@ -67,6 +71,7 @@ class Problem:
     derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
     constant_derivatives: Callable[[Array, Any, Any], Mapping[str, Array]] | None = None
     linear: bool = False
+    settled: Callable[[Problem, Any], Any] | None = None
 
     @cached_property
     def y(self) -> Array:

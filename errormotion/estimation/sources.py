@@ -51,6 +51,8 @@ class Places:
         The equation receives sums of rows with these weights.
     count : int
         Number of places.
+    estimated : bool
+        Whether places are unknown (NaN) whose row of the eliminated unknowns is not estimated.
     only : sequence of str
         Names of the tables that the errors depend on; default: all of which a place has a row.
     """
@@ -60,6 +62,7 @@ class Places:
     only: Sequence[str] = ()
     rows: Mapping[str, Index] = field(default_factory=dict)
     weights: Mapping[str, Array] = field(default_factory=dict)
+    estimated: bool = False
 
     def tables(self, problem: Problem, values: Sequence[Array]) -> list[Table | None]:
         """Return the index map of each table with these values; None for one that the errors do not depend on."""
@@ -169,6 +172,10 @@ def errors_of(
             f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})",
             code="estimation.places.no_errors",
         )
+    local = linear.numbering.local
+    if places.estimated and local in tables:
+        estimated = problem.unknowns[local].freed[tables[local].index2[:, 0]].any(axis=1)
+        value = np.where(estimated[:, None], value, np.nan)
     if not sources:
         return Errors(value, np.zeros((*value.shape, value.shape[1])), [])
     its = by_rows(equation, list(tables.values()), [values[k] for k in seen], range(len(seen)))

@@ -23,6 +23,7 @@ from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.fewest import fewest
 from errormotion.estimation.fit import Fit, fit
+from errormotion.estimation.normal import SingularError
 from errormotion.estimation.problem import Problem, Unknown
 from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import expansion
@@ -101,10 +102,14 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
             cleaned=search,
             rounding=rounding,
             propagated=sources,
+            factor=factor,
         )
         return solved if observed.finish is None else observed.finish(solved)
     except FitError as error:
-        raise MethodError(f"{str(error)[:1].upper()}{str(error)[1:]}.", code=error.code) from error
+        text = str(error)
+        if isinstance(error.__cause__, SingularError) and observed.undetermined is not None:
+            text = observed.undetermined(observed.problem)
+        raise MethodError(f"{text[:1].upper()}{text[1:].rstrip('.')}.", code=error.code) from error
 
 
 def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, Cleaned | None]:
@@ -247,7 +252,7 @@ def dataset(
         "sources": names,
         "source_groups": [source.group for source in errors.sources],
         "source_ids": {name: s.identity for name, s in zip(names, errors.sources, strict=True) if s.identity},
-        "extras": dict(observed.extras) | of_readings(solved, raw) | dict(model.results(observed, solved.fit, datum)),
+        "extras": of_readings(solved, raw) | dict(observed.extras) | dict(model.results(observed, solved.fit, datum)),
         "start": "" if planned else start_of(raw, observed.zero),
         "measured": None if planned else raw.attrs,
         "notes": notes,

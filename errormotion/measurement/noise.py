@@ -74,6 +74,7 @@ def scatter_of(observed: Observed, found: Fit) -> tuple[Scatter, Fit]:
         found.chi2,
         found.freedom,
         stated=stated,
+        stated_freedom=observed.problem.noise.freedom,
         increase=observed.noise_increases,
         priors=priors,
         estimate=estimate if priors else None,

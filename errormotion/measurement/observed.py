@@ -100,6 +100,8 @@ class Observed:
         Whether all numbers of a reading are wrong together; see `errormotion.estimation.checks.exclusions.cleaned`.
     structure : callable, optional
         What depends on the readings that are used; see there. ``problem`` fulfils it.
+    undetermined : callable, optional
+        From a problem whose readings do not determine its unknowns to a sentence on the reason, with a remedy.
     finish : callable, optional
         From the solution to one with whatever else follows from it: names, notes and variables of the result, or other
         errors. Called after each solution, also that of a plan and of a trial (`Solved.propagated`).
@@ -151,6 +153,7 @@ class Observed:
     name: Callable[[Index], str] | None = None
     whole: bool = False
     structure: Callable[[Problem], Problem] | None = None
+    undetermined: Callable[[Problem], str] | None = None
     finish: Callable[[Solved], Solved] | None = None
     extras: Mapping[str, xr.DataArray] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -175,6 +178,8 @@ class Solved:
         With independent noise of the stated size, for residuals and reliability.
     rounding : Rounding, optional
         What rounding adds to the noise.
+    factor : float
+        Variance factor of the readings that the covariances of ``fit`` lack.
     scatter : Scatter
         What the residuals say about the noise.
     relative : Relative
@@ -197,6 +202,7 @@ class Solved:
     cleaned: Cleaned | None = None
     rounding: Rounding | None = None
     propagated: bool = True
+    factor: float = 1.0
 
     @property
     def fit_factor(self) -> float:

@@ -483,3 +483,21 @@ def test_a_linear_problem_has_its_derivatives_computed_once() -> None:
     assert far.unknowns.line == pytest.approx(fit(plain).unknowns.line, rel=1e-10)
     assert far.residual == pytest.approx(fit(plain).residual, abs=1e-9)
     assert far.normal.covariance == pytest.approx(fit(plain).normal.covariance, rel=1e-9)
+
+
+def test_unknowns_that_differ_along_the_gauge_are_settled_after_each_step() -> None:
+    """Differences of three levels do not determine their mean, which is settled at 5."""
+    index = np.array([[0, 1], [1, 2], [0, 2]])
+
+    def equation(y: Array, u: Line[Array], c: Any) -> Array:
+        return np.asarray(y - (u.line[:, 1, 0] - u.line[:, 0, 0]))
+
+    problem = Problem(
+        equation=equation,
+        readings=np.array([1.0, 2.0, 3.0]),
+        unknowns=Line(Block(start=np.zeros((3, 1)), index=index, scale=1.0, group="level")),
+        noise=Noise(sd=np.ones(3)),
+        gauge={"line": np.ones((1, 3, 1))},
+        settled=lambda _, x: x._replace(line=x.line - x.line.mean() + 5.0),
+    )
+    assert fit(problem).unknowns.line.ravel() == pytest.approx([5 - 4 / 3, 5 - 1 / 3, 5 + 5 / 3])

@@ -381,3 +381,14 @@ def test_a_table_that_the_errors_do_not_depend_on_is_named() -> None:
     places = Places(lambda x, c: x.error + 0.0 * np.nan_to_num(c.scale), TARGETS, only=("error",))
     maps = places.tables(found.problem, [*found.linear.at.tables, *found.problem.constant_tables(found.linear.at)])
     assert [each is None for each in maps] == [False, True, True, True]
+
+
+def test_a_place_whose_unknowns_are_not_estimated_is_unknown_where_the_places_state_it() -> None:
+    free = np.arange(TARGETS) != 3
+    whole = problem(np.zeros(TARGET.size))
+    one = replace(whole, unknowns=whole.unknowns._replace(error=replace(whole.unknowns.error, free=free)))
+    places = Places(errors, TARGETS)
+    assert np.isfinite(errors_of(fit(one), places).value).all()
+    found = errors_of(fit(one), replace(places, estimated=True))
+    assert np.flatnonzero(np.isnan(found.value[:, 0])).tolist() == [3]
+    assert np.flatnonzero(np.isnan(found.own[:, 0, 0])).tolist() == [3]

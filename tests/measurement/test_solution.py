@@ -213,3 +213,40 @@ def test_touches_with_one_residual_each_have_the_reliability_of_a_dense_calculat
     assert found["smallest_error_effect"].values == pytest.approx(largest, rel=1e-3)
     assert np.abs(found["residual"].values).max() < 5 * sd
     assert not found["left_out"].values.any()
+
+
+def test_a_stated_noise_with_few_degrees_of_freedom_is_combined_with_the_residuals() -> None:
+    y = readings(4)
+    vague = observed(y, 0.4e-6)
+    vague = replace(vague, problem=replace(vague.problem, noise=replace(vague.problem.noise, freedom=10.0)))
+    solved = solve(vague)
+    found = fit(problem(y, 0.4e-6))
+    Q, f = found.chi2, found.freedom
+    # GUM H.3.6: independent estimates of one variance are weighted by their degrees of freedom.
+    assert solved.scatter.factor == pytest.approx((10 + Q) / (10 + f), rel=1e-9)
+    assert solved.scatter.freedom == 10 + f
+
+
+def test_a_noise_with_few_degrees_of_freedom_makes_no_outliers() -> None:
+    """Stated at half of the truth, a certain noise makes an outlier of one reading in many data sets."""
+    found = []
+    for freedom in (np.inf, 8.0):
+        out = 0
+        for seed in range(60):
+            one = observed(readings(seed, 0.8e-6), 0.5e-6)
+            noise = replace(one.problem.noise, freedom=freedom)
+            solved = solve(replace(one, problem=replace(one.problem, noise=noise)))
+            out += bool(solved.cleaned is not None and solved.cleaned.made)
+        found.append(out)
+    assert found[1] <= 1
+    assert found[0] >= found[1]
+
+
+def test_the_reason_of_undetermined_unknowns_is_that_of_the_model() -> None:
+    y = readings(5)
+    one = observed(y, 0.5e-6)
+    with pytest.raises(MethodError, match="do not determine level"):
+        solve(replace(one, problem=replace(one.problem, equation=lambda y, x, c: y + 0.0 * x.level[:, 0])))
+    lost = replace(one.problem, equation=lambda y, x, c: y + 0.0 * x.level[:, 0])
+    with pytest.raises(MethodError, match=r"Nothing is seen of it\."):
+        solve(replace(one, problem=lost, undetermined=lambda _: "nothing is seen of it"))

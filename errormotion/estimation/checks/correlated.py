@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
@@ -106,6 +105,8 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
     typical : float
         See `TYPICAL`.
     """
+    from scipy.optimize import minimize_scalar
+
     problem, at = found.problem, found.linear.at
     near = _linear(problem, at)
 

@@ -419,7 +419,8 @@ class _Sequence:
 
     def __init__(self, fit: Fit, numbers: Numbers, of_structure: float, limit: float) -> None:
         self.numbers, self.k, self.limit = numbers, numbers.k, limit
-        stated = fit.problem.noise.stated
+        # A noise that is itself an estimate makes outliers of valid readings where it is too small.
+        stated = fit.problem.noise.stated and np.isinf(fit.problem.noise.freedom)
         self.noise = _Noise(stated, stated, fit.chi2, fit.freedom)
         self.where = list[At]()
         gain = np.where(numbers.tested, numbers.gain, 0.0)

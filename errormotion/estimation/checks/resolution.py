@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
 
 from errormotion.arrays import Array
 from errormotion.estimation.blocks import Index
@@ -91,6 +90,7 @@ def noise_before(step: float, scatter: float) -> float:
     """Return the noise before rounding of repeated readings with this standard deviation."""
     if not step > 0 or scatter <= 0:
         return max(scatter, 0.0)
+    from scipy.optimize import brentq
 
     def more(s: float) -> float:
         return s**2 + step**2 / 12 - float(common(step, s)) ** 2 - scatter**2

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from errormotion.measurement import ModelMethod
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
-from errormotion.plugins import Bench, Method, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
+from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -14,16 +15,18 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.kinematics.description import MachineDescription
+    from errormotion.measurement import Observed
+    from errormotion.plugins import Redrawing
 
 
-class Multilateration(Method):
+class Multilateration(ModelMethod):
     """Errors of the volume and of the axes from distances of a reflector to four or more positions of a tracker."""
 
     info: ClassVar[MethodInfo] = MethodInfo(
         id="multilateration",
         summary="Volumetric error and the errors of three axes from tracker distances, stations and dead paths unknown",
         status="simulated_only",
-        version="4",
+        version="5",
         cannot_see=(
             "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",
@@ -41,7 +44,6 @@ class Multilateration(Method):
     simulate = lazy("errormotion.methods.multilateration.simulation:simulate")
     truth = lazy("errormotion.methods.multilateration.simulation:truth_of")
     conformance = lazy("errormotion.methods.multilateration.conformance:subjects")
-    redrawing = lazy("errormotion.methods.multilateration.redrawing:redrawing")
 
     def acquire(
         self,
@@ -108,32 +110,35 @@ class Multilateration(Method):
         """Return the number of set-ups."""
         return float(len(settings.measuring.sequence or settings.layout.stations))
 
+    def observe(self, raw: xr.Dataset, settings: MultilaterationSettings) -> Observed:
+        """Return the readings as a network; see ``result`` and ``model``."""
+        from errormotion.methods.multilateration.result import observe
+
+        return observe(raw, settings)
+
     def identify(self, raw: xr.Dataset, settings: MultilaterationSettings | None = None) -> xr.Dataset:
-        """Return the error dataset of component ``tool`` over ``target``.
+        """Return the error dataset of component ``tool`` over ``target``, from the last set-up of each station."""
+        from errormotion.methods.multilateration.readings import latest
 
-        Parameters
-        ----------
-        raw : Dataset
-            Schema ``errormotion.raw.multilateration/1``; not modified.
-        settings : Settings, optional
+        return super().identify(latest(raw), settings)
 
-        Raises
-        ------
-        DatasetError
-            The raw dataset violates its schema; all violations are reported together.
-        MethodError
-            The data do not determine the result, or contradict one another.
-        """
-        from errormotion.datasets.validation import checked_raw
-        from errormotion.methods.multilateration.acquisition.measure import latest
-        from errormotion.methods.multilateration.identification.identify import identify_targets
+    def expected(self, settings: MultilaterationSettings) -> xr.Dataset:
+        """Return the readings of the layout without errors; see ``planning.plan``."""
+        from errormotion.methods.multilateration.planning.plan import expected
 
-        settings = settings or MultilaterationSettings()
-        checked = checked_raw(raw, self)
-        return identify_targets(latest(checked), settings, self.info.id, self.info.version)
+        return expected(settings)
+
+    def redrawing(self, raw: xr.Dataset, settings: MultilaterationSettings, errors: xr.Dataset) -> Redrawing:
+        """Return all sources of the model; the repeatability of simultaneous stations displaces the targets."""
+        from errormotion.methods.multilateration.readings import latest
+        from errormotion.methods.multilateration.repeatability import displaced
+
+        found = super().redrawing(latest(raw), settings, errors)
+        return displaced(found, errors) if settings.together and "repeatability" in errors else found
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
-        """Return an error dataset of zeros with the expected covariance of the layout."""
-        from errormotion.methods.multilateration.planning.plan import plan
+        """Return an error dataset of zeros with the expected covariance of the layout, and the best layout."""
+        from errormotion.methods.multilateration.planning.plan import with_best_layout
 
-        return plan(self.info, settings or MultilaterationSettings())
+        settings = settings or MultilaterationSettings()
+        return with_best_layout(super().plan(settings), settings, settings.planning)

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.twists import move, rigid_motions
-from errormotion.methods.multilateration.names import station_names, target_names
+from errormotion.methods.multilateration.readings import station_names, target_names
 from errormotion.methods.multilateration.schema import SCHEMA
+from errormotion.methods.multilateration.start import Stations, readings
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
@@ -39,10 +40,11 @@ _M, _S = {"units": "m"}, {"units": "s"}
 def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return raw data of the layout of the settings on a virtual C-frame, and the true errors of its targets.
 
+    Every source of the measurement model is drawn once.
+
     Parameters
     ----------
     settings : Settings
-        Layout, repeatability, and what is uncertain besides: each source of the equation is drawn once.
     seed : int
         Of the machine and of the measurement.
 
@@ -51,34 +53,23 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     BenchError
         Targets out of the travel of the machine.
     """
-    from errormotion.methods.multilateration.identification.expansion import along_beams, expected_sources
-    from errormotion.methods.multilateration.network.model import directions
-    from errormotion.methods.multilateration.planning.layout import grid
+    from errormotion.measurement.drawing import simulate as drawn
+    from errormotion.methods.multilateration.method import Multilateration
 
-    machine, layout = VirtualMachine("cframe", seed=seed), settings.layout
-    position = grid(layout)[0]
-    target, station = position + np.array(layout.reflector), np.array(layout.stations)
-    sources, rng = expected_sources(settings, position, target), np.random.default_rng([seed, 3])
-    scale = sum(u * rng.normal() for u in (*sources.air.values(), *sources.tracker.values()))
-    change = np.zeros((len(station), len(target))) + sum(rng.normal() * each.change for each in sources.scales)
-    measured = raw(
-        machine,
-        position,
-        station,
-        seed=seed,
-        reflector=layout.reflector,
-        noise=layout.displacement_noise,
-        repeatability=settings.repeatability or 0.0,
-        scale=scale,
-    )
-    if (e := settings.expansion) is not None:
-        warm = e.reference if e.temperature is None else e.temperature
-        strain = np.full((len(station), 3), e.coefficient * (warm - e.reference))
-        change = change + along_beams(strain, position - position.mean(axis=0), directions(target, station))
-        measured["scale_temperature"] = (("station", "direction"), np.full(strain.shape, warm), {"units": "degC"})
-    measured["displacement"] = measured["displacement"] + change
-    measured["displacement"].attrs.update(_M)
-    return measured, true_errors(machine, position, layout.reflector)
+    machine = VirtualMachine("cframe", seed=seed)
+
+    class OnMachine(Multilateration):
+        """The method with readings of the machine as expected ones."""
+
+        def expected(self, settings: Settings) -> xr.Dataset:
+            exact = super().expected(settings)
+            position = (exact["target_nominal"] - exact["reflector"]).transpose("target", "direction").values
+            _require_within_travel(machine, position)
+            point = reflector_positions(machine, position, settings.layout.reflector)
+            d = readings(point, Stations(exact["station_nominal"].values, np.zeros(exact.sizes["station"])))
+            return exact.assign(displacement=exact["displacement"].copy(data=d))
+
+    return drawn(OnMachine(), settings, seed, Multilateration.info)
 
 
 def target_grid(machine: VirtualMachine, count: Sequence[int] = (5, 5, 4), share: float = 0.7) -> Array:

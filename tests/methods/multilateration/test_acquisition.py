@@ -8,9 +8,10 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.methods.multilateration.acquisition.measure import latest, measure_stations
-from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.acquisition.measure import measure_stations
+from errormotion.methods.multilateration.networks import solve
 from errormotion.methods.multilateration.planning import layout
+from errormotion.methods.multilateration.readings import latest
 from errormotion.methods.multilateration.settings import Measuring, Settings
 
 STATIONS = ((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5))
@@ -150,7 +151,7 @@ def test_stations_return_one_dataset_each_and_determine_the_errors():
     error = (true - nominal).ravel()
     error -= G @ np.linalg.lstsq(G, error)[0]
     miss = (network.target - nominal).ravel() - error
-    spread = np.sqrt(np.diagonal(network.target_covariance, axis1=1, axis2=2)).ravel()
+    spread = np.sqrt(np.diagonal(network.covariance, axis1=1, axis2=2)).ravel()
     # 60 numbers, and the fitted rotation is small but not infinitely so: its square times 0.2 m is far below 1e-8 m.
     assert np.all(np.abs(miss) < 4.5 * spread + 1e-8)
     assert np.abs(error).max() > 20 * spread.max()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.multilateration.identification.drift import estimate_drift, positions
+from errormotion.methods.multilateration.drift import estimate_drift, positions
 
 NOISE = 0.5e-6
 TARGETS, RETURNS = 30, 12

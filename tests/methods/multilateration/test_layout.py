@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.networks import bound
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.bound import bound, predicted_uncertainty
+from errormotion.methods.multilateration.planning.bound import predicted_uncertainty
 from errormotion.methods.multilateration.planning.sight import Sight, blocked
 from errormotion.methods.multilateration.settings import Box, Layout, Planning
 
@@ -34,7 +35,7 @@ def largest(stations, sight=OPEN, target=CUBE):
         network = bound(target, stations, noise=1e-6, seen=sight.sees(stations, target))
     except MethodError:
         return np.inf
-    return float(layout.uncertainty(network.target_covariance).max())
+    return float(layout.uncertainty(network.covariance).max())
 
 
 def brute(low, high, sight=OPEN, points=7):
@@ -84,7 +85,7 @@ def test_all_four_may_be_free_and_the_result_is_better_than_the_start():
 @pytest.mark.usefixtures("short_search")
 def test_the_mean_may_be_minimised_instead():
     def mean(stations):
-        return layout.uncertainty(bound(CUBE, stations, noise=1e-6).target_covariance).mean()
+        return layout.uncertainty(bound(CUBE, stations, noise=1e-6).covariance).mean()
 
     by_mean = layout.optimise(CUBE, one_free(LOW, HIGH), OPEN, noise=1e-6, minimise="mean")
     by_largest = layout.optimise(CUBE, one_free(LOW, HIGH), OPEN, noise=1e-6)
@@ -189,7 +190,7 @@ def test_the_uncertainty_that_is_minimised_is_that_of_the_network():
     target, stations = layout.grid(Layout(count=(3, 3, 3)))[1], np.array(Layout().stations)
     seen = np.ones((4, 27), dtype=bool)
     seen[0, 3] = seen[2, 9] = seen[1, 9] = False
-    expected = layout.uncertainty(bound(target, stations, noise=1e-6, seen=seen).target_covariance)
+    expected = layout.uncertainty(bound(target, stations, noise=1e-6, seen=seen).covariance)
     np.testing.assert_allclose(predicted_uncertainty(seen / 1e-6, stations, target), expected, rtol=1e-9)
     flat = stations * (1.0, 1.0, 0.0)
     assert predicted_uncertainty(seen / 1e-6, flat, target) is None

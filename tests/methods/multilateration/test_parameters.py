@@ -8,7 +8,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.twists import cross_matrix, move
 from errormotion.methods.multilateration import simulation
-from errormotion.methods.multilateration.identification.parameters import fit_machine, misfit_note, reference_of
+from errormotion.methods.multilateration.axes import fit_machine, misfit_note, reference_of
 from errormotion.twin import VirtualMachine
 
 REFLECTOR = np.array([0.02, -0.01, -0.08])

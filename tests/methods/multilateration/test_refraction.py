@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.refraction import (
+from errormotion.methods.multilateration.refraction import (
     MODEL_UNCERTAINTY,
     QUANTITIES,
     index_uncertainty,

@@ -287,22 +287,14 @@ def test_a_plan_draws_its_map_and_lists_the_targets_to_measure(tmp_path):
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_repeatability_of_the_machine_is_a_line_of_the_budget(tmp_path):
+def test_the_share_of_the_repeatability_is_stated(tmp_path):
     machine = VirtualMachine("cframe", seed=3)
     raw = simulation.raw(machine, simulation.target_grid(machine, (4, 4, 3)), seed=1, repeatability=2 * UM)
     errors = Multilateration().identify(raw, Multilateration.Settings(repeatability="2 um", parametric=False))
     html = page(errors, tmp_path)
-    table = html[html.index("Uncertainty budget") :]
+    table = html[html.index("The solution.") :]
     cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", table[: table.index("</table>")], flags=re.S)
     text = [unescape(re.sub(r"<[^>]+>", "", cell)).strip() for cell in cells]
-    names = {
-        "machine": "repeatability of the machine",
-        "tracker": "stations, by the tracker's noise",
-        "own": "noise of the target's own readings",
-        "all": "combined, k = 1",
-    }
-    rows = {key: np.array(text[text.index(name) + 1 :][:3], float) for key, name in names.items()}
-    # Figures of three digits.
-    parts = np.sqrt(rows["machine"] ** 2 + rows["tracker"] ** 2 + rows["own"] ** 2)
-    np.testing.assert_allclose(parts, rows["all"], rtol=0.01)
-    assert (rows["machine"] > 3 * rows["own"]).all()
+    # 2 um beside the tracker's 0.5 um: 4 / 4.25
+    share = text[text.index("share of the repeatability of the machine in the variance of a reading / %") + 1]
+    assert float(share) == pytest.approx(100 * 4 / 4.25, abs=0.5)

@@ -7,10 +7,9 @@ from scipy.stats import chi2, norm
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import rigid_motions
-from errormotion.methods.multilateration.network.diagnosis.notes import notes_of
-from errormotion.methods.multilateration.network.model import Shared, Sources, Stations, directions, readings
-from errormotion.methods.multilateration.network.solver import solve
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.model import Shared, Sources
+from errormotion.methods.multilateration.networks import bound, solve, station_covariance
+from errormotion.methods.multilateration.start import Stations, directions, readings
 
 # Around a cube of 100 mm, at distances like its size: the linear regime at 1 um.
 NEAR = np.array(
@@ -49,7 +48,7 @@ def jacobian(target, stations, known):
 
 def joint(network):
     """Return the covariance of all targets, (3 m, 3 m)."""
-    errors = network.moved.errors
+    errors = network.solved.relative.errors
     m, F = len(errors.value), errors.influence.reshape(len(errors.sources), -1)
     C = F.T @ F
     C.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m)] += errors.own
@@ -98,7 +97,7 @@ def test_agrees_with_a_dense_least_squares_solver(n):
     def off(x):
         return (readings(*unpack(x)) - d).T.ravel() / NOISE
 
-    start = np.concatenate([network.target.ravel() + 1e-6, np.column_stack([U, network.dead_path]).ravel()])
+    start = np.concatenate([network.target.ravel() + 1e-6, np.column_stack([U, network.stations.dead_path]).ravel()])
     found = least_squares(
         off,
         start,
@@ -113,7 +112,7 @@ def test_agrees_with_a_dense_least_squares_solver(n):
     assert np.abs(between - np.linalg.norm(target[:, None] - target, axis=-1)).max() < 1e-11
     assert network.sigma0 == pytest.approx(np.sqrt(2 * found.cost / network.freedom), rel=1e-9)
     assert network.freedom == 15 * (n - 3) - (4 * n - 6)
-    assert stations.position.shape == network.station.shape
+    assert stations.position.shape == network.stations.position.shape
 
 
 def test_a_free_network_is_fitted_to_the_nominal_targets():
@@ -131,7 +130,7 @@ def test_a_free_network_is_fitted_to_the_nominal_targets():
     assert np.sqrt(np.mean((error - (true - u)) ** 2)) < 10e-6
 
 
-@pytest.mark.parametrize(("n", "missing"), [(4, 0), (4, 6), (6, 20)])
+@pytest.mark.parametrize(("n", "missing"), [(4, 0), (4, 3), (6, 20)])
 def test_covariances_are_those_of_the_full_system(n, missing):
     u = nominal_targets(20)
     rng = np.random.default_rng(3)
@@ -140,20 +139,20 @@ def test_covariances_are_those_of_the_full_system(n, missing):
     for i in rng.choice(20, missing, replace=False):
         seen[rng.integers(n), i] = False
     network = bound(u, NEAR[:n], noise=noise, seen=seen)
-    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), network.in_datum)
+    C = dense_covariance(u, NEAR[:n], np.where(seen, 1 / noise, 0.0), np.isfinite(network.target[:, 0]))
     scale = np.abs(C[:60, :60]).max()
     blocks = C[:60, :60].reshape(20, 3, 20, 3)[np.arange(20), :, np.arange(20)]
     # Eight digits: the condition of the bordered system is its square.
-    assert np.abs(network.target_covariance - blocks).max() < 1e-8 * scale
+    assert np.abs(network.covariance - blocks).max() < 1e-8 * scale
     assert np.abs(joint(network) - C[:60, :60]).max() < 1e-8 * scale
-    assert np.abs(network.joint_covariance - C[60:, 60:]).max() < 1e-8 * np.abs(C[60:, 60:]).max()
+    assert np.abs(station_covariance(network.solved) - C[60:, 60:]).max() < 1e-8 * np.abs(C[60:, 60:]).max()
 
 
 def test_redundancies_are_those_of_the_hat_matrix():
     u = nominal_targets(14)
     network = bound(u, NEAR[:5], noise=NOISE)
     J = jacobian(u, network.stations, np.ones((5, 14), dtype=bool)) / NOISE
-    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), network.in_datum) @ J.T
+    hat = J @ dense_covariance(u, NEAR[:5], np.full((5, 14), 1 / NOISE), np.isfinite(network.target[:, 0])) @ J.T
     assert np.abs(network.redundancy.T.ravel() - (1 - np.diag(hat))).max() < 1e-6
     assert network.redundancy.sum() == pytest.approx(network.freedom, rel=1e-8)
 
@@ -165,10 +164,10 @@ def test_stated_uncertainty_is_correct():
     for seed in range(seeds):
         network = solve(measured(u, NEAR[:4], NOISE, seed), u, noise=NOISE)
         targets.append(network.target - u)
-        stations.append(network.station - NEAR[:4])
+        stations.append(network.stations.position - NEAR[:4])
         squares.append(network.sigma0**2 * network.freedom)
     targets, stations = np.array(targets), np.array(stations)
-    inside = np.abs(targets) < norm.isf(0.025) * np.sqrt(np.diagonal(truth.target_covariance, axis1=1, axis2=2))
+    inside = np.abs(targets) < norm.isf(0.025) * np.sqrt(np.diagonal(truth.covariance, axis1=1, axis2=2))
     # 7200 values in some 60 x 114 independent ones: the share scatters by 0.3 %.
     assert abs(inside.mean() - 0.95) < 4 * np.sqrt(0.95 * 0.05 / (seeds * 114))
     values, vectors = np.linalg.eigh(joint(truth))
@@ -207,7 +206,7 @@ def test_cached_quantities_do_not_depend_on_the_order_of_access():
     d += 1.0
     u += 1.0
     assert np.array_equal(late.residual, residual)
-    assert np.array_equal(late.target_covariance, early.target_covariance)
+    assert np.array_equal(late.covariance, early.covariance)
 
 
 def test_missing_distances_increase_the_uncertainty_as_predicted():
@@ -216,19 +215,18 @@ def test_missing_distances_increase_the_uncertainty_as_predicted():
     d[:2, 4], d[3, 11], d[0, 20] = np.nan, np.nan, np.nan
     network = solve(d, u, noise=NOISE)
     assert np.isnan(network.target[4]).all()
-    assert np.isnan(network.target_covariance[4]).all()
+    assert np.isnan(network.covariance[4]).all()
     assert np.isfinite(np.delete(network.target, 4, axis=0)).all()
     # Three distances give a place, but say nothing about the stations.
     assert network.freedom == 30 - 3 - 10
     assert network.uncertainty[11] > np.nanmedian(network.uncertainty)
-    assert any("without a position (1): 5" in note for note in notes_of(network))
 
 
 def test_a_less_accurate_station_has_less_weight():
     u = nominal_targets(60)
     sigma = np.array([1e-6, 1e-6, 1e-6, 1e-6, 20e-6])
     d = measured(u, NEAR[:5], sigma[:, None])
-    network = solve(d, u, noise=sigma)
+    network = solve(d, u, noise=sigma[:, None])
     assert network.sigma0 == pytest.approx(1.0, abs=4 / np.sqrt(2 * network.freedom))
     four = bound(u, NEAR[:4], noise=NOISE).uncertainty
     assert (network.uncertainty < four * (1 + 1e-9)).all()
@@ -240,12 +238,12 @@ def test_drift_is_estimated_with_its_uncertainty():
     # One station's displacements are off in proportion to the time of the reading.
     time = np.zeros((4, 80))
     time[1] = np.linspace(0, 1, 80)
-    drift, found = Sources(drift=[Shared("drift", "drift", 70e-6 * time)]), []
+    drift, found = Sources(drift=[Shared("drift", 70e-6 * time)]), []
     for seed in range(40):
         d = measured(u, NEAR[:4], NOISE, seed) + 7e-6 * time
         network = solve(d, u, noise=NOISE, sources=drift)
-        off = network.fit.unknowns.drift[1, 0] - 0.1
-        found.append(off / np.sqrt(network.fit.normal.covariance[-1, -1]))
+        off = network.solved.fit.unknowns.drift[1, 0] - 0.1
+        found.append(off / np.sqrt(network.solved.fit.normal.covariance[-1, -1]))
     assert 1e-4 < chi2.cdf(np.sum(np.square(found)), 40) < 1 - 1e-4
 
 
@@ -254,9 +252,9 @@ def test_the_effect_of_a_source_is_that_of_changed_readings():
     d = measured(u, NEAR[:4], NOISE)
     d[1, 3] = np.nan
     change = 2e-6 * np.cos(np.arange(160.0)).reshape(4, 40)
-    sources = Sources(air={"air": 1e-6}, scales=[Shared("a", "scales", change)])
+    sources = Sources(air={"air": 1e-6}, scales=[Shared("a", change)])
     before = solve(d, u, noise=NOISE, robust=False, sources=sources)
-    effect = {source.name: source.effect for source in before.moved.errors.sources}
+    effect = {source.name: source.effect for source in before.solved.relative.errors.sources}
     for name, by in (("a", change), ("air", 1e-6 * d)):
         after = solve(d + by, u, noise=NOISE, robust=False)
         moved = effect[name]
@@ -277,7 +275,6 @@ def test_inaccurate_approximate_positions_have_no_effect():
     [
         ({"target": np.zeros((9, 3))}, r"Expected displacements \(station, target\)"),
         ({"noise": 0.0}, "Expected a positive standard deviation"),
-        ({"noise": np.ones(3)}, "Expected the noise as one value"),
         ({"station": np.zeros((3, 3))}, "Expected approximate positions"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.network.start import initial_stations
+from errormotion.methods.multilateration.start import initial_stations
 
 STATION = np.array([[-0.35, -0.3, -0.15], [0.36, -0.33, 0.02], [0.0, 0.37, -0.15], [0.02, 0.01, 0.4]])
 FAR = 10 * STATION

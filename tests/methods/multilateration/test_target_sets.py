@@ -9,14 +9,13 @@ from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration import Multilateration
-from errormotion.methods.multilateration.identification.parameters import fit_machine
-from errormotion.methods.multilateration.network.solver import solve
+from errormotion.methods.multilateration.axes import fit_machine
+from errormotion.methods.multilateration.networks import bound, solve
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.methods.multilateration.planning.choosing import positions, refuse_count
-from errormotion.methods.multilateration.planning.plan import plan
 from errormotion.methods.multilateration.planning.sight import Sight
 from errormotion.methods.multilateration.planning.target_sets import Expected, Volume
+from errormotion.methods.multilateration.result import OF_DATUM
 from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
 
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
@@ -64,7 +63,7 @@ def test_no_exchange_of_one_target_improves_the_choice():
 def test_with_all_candidates_measured_the_uncertainty_is_that_of_the_bound():
     place = GRID + REFLECTOR
     everything = bound(place, STATIONS, noise=NOISE)
-    own = np.sqrt(np.trace(everything.target_covariance, axis1=1, axis2=2))
+    own = np.sqrt(np.trace(everything.covariance, axis1=1, axis2=2))
     # What is left is the share of their own noise in the datum: 6 motions of 375 coordinates.
     np.testing.assert_allclose(volume("target").worth(range(len(place))), own, rtol=0.04)
 
@@ -84,9 +83,12 @@ def test_the_prediction_for_a_further_target_is_the_scatter_of_measurements():
         again = d + NOISE * rng.normal(size=d.shape)
         u = place.copy()
         for _ in range(4):
-            way = u - network.station[:, None]
+            way = u - network.stations.position[:, None]
             length = np.linalg.norm(way, axis=2)
-            E, r = (way / length[..., None]).transpose(1, 0, 2), (again - (length - network.dead_path[:, None])).T
+            E, r = (
+                (way / length[..., None]).transpose(1, 0, 2),
+                (again - (length - network.stations.dead_path[:, None])).T,
+            )
             u = u + np.linalg.solve(E.transpose(0, 2, 1) @ E, np.einsum("kja,kj->ka", E, r)[..., None])[..., 0]
         change = (u - place).ravel()
         off.append((change - G @ np.linalg.lstsq(G, change)[0]).reshape(place.shape))
@@ -110,9 +112,10 @@ def test_the_prediction_for_the_axes_is_the_scatter_of_fits():
         d = np.linalg.norm(there - STATIONS[:, None], axis=2)
         d = d + NOISE * rng.normal(size=d.shape)
         network = solve(d, place[chosen], STATIONS, noise=NOISE, robust=False)
-        influence = np.array([each.effect for each in network.moved.errors.sources[: len(network.errors.sources)]])
+        solved = network.solved
+        influence = np.array([each.effect for each in solved.relative.errors.sources if each.joined not in OF_DATUM])
         axes = fit_machine(
-            CHAIN, GRID[chosen], network.target - place[chosen], network.errors.own, influence,
+            CHAIN, GRID[chosen], network.target - place[chosen], solved.factor * solved.fit.normal.own, influence,
             reflector=np.tile(REFLECTOR, (len(chosen), 1)), max_order=4,
         )  # fmt: skip
         found = axes.volume.columns(axes.terms, GRID, np.tile(REFLECTOR, (len(GRID), 1))) @ axes.coefficient
@@ -155,7 +158,7 @@ BOXES = [
 def planned(**changes):
     targets = {"count": 27, "candidates": (4, 4, 4), "uncertainty": "target"} | changes
     settings = Settings(**SETTINGS, planning={"boxes": BOXES, "targets": targets, "acceptance": np.radians(50)})
-    return settings, plan(Multilateration.info, settings)
+    return settings, Multilateration().plan(settings)
 
 
 @pytest.fixture(scope="module")
@@ -209,10 +212,10 @@ def test_a_campaign_measures_the_chosen_targets(made, tmp_path):
     where = Settings(
         **SETTINGS, planning={"boxes": [{"low": U, "high": U} for U in map(tuple, STATIONS)], "write": file}
     )
-    assert f"The best layout is in {file}" in "\n".join(plan(Multilateration.info, where).attrs["notes"])
+    assert f"The best layout is in {file}" in "\n".join(Multilateration().plan(where).attrs["notes"])
     assert tomllib.loads(file.read_text())["test"]["settings"]["layout"]["count"] == [3, 3, 3]
     with pytest.raises(MethodError, match="the file cannot be created"):
-        plan(Multilateration.info, where)
+        Multilateration().plan(where)
 
 
 def test_a_budget_of_time_is_a_number_of_targets():
@@ -234,8 +237,7 @@ def test_wrong_settings_are_refused_with_a_remedy():
     with pytest.raises(ValueError, match="both low and high, the corners"):
         Choosing(count=12, low=(0, 0, 0))
     with pytest.raises(MethodError, match="chain: expected the chain of the machine"):
-        plan(
-            Multilateration.info,
+        Multilateration().plan(
             Settings(layout=SETTINGS["layout"], planning={"targets": {"count": 20, "candidates": (3, 3, 3)}}),
         )
 

@@ -20,7 +20,7 @@ from errormotion.datasets.clock import steady
 from errormotion.errors import MethodError
 from errormotion.methods.multilateration.acquisition.motions import stations, tour
 from errormotion.methods.multilateration.acquisition.scales import Scales
-from errormotion.methods.multilateration.names import station_names, target_names
+from errormotion.methods.multilateration.readings import station_names, target_names
 from errormotion.methods.multilateration.schema import SCHEMA
 from errormotion.plugins.virtual import is_virtual, wait
 
@@ -96,15 +96,6 @@ def measure_stations(
                 yield raw
             if share <= setups.measuring.poor:
                 break
-
-
-def latest(raw: xr.Dataset) -> xr.Dataset:
-    """Return raw data with only the last set-up of each station; unchanged without names of stations."""
-    if "station" not in raw.coords:
-        return raw
-    last = {str(name): j for j, name in enumerate(raw["station"].values)}
-    kept = sorted(last.values())
-    return raw if len(kept) == raw.sizes["station"] else raw.isel(station=kept)
 
 
 def _broken(raw: xr.Dataset) -> list[float]:

@@ -1,63 +1,18 @@
 """Predicted uncertainty of a layout: the Cramer-Rao bound of targets and stations.
 
-The covariance of a network depends only on positions and noise. The estimates of `solver` reach it if the uncertainty
-of the stations is small compared with their distances.
+The covariance of a network depends only on positions and noise. Its estimates reach it if the uncertainty of the
+stations is small compared with their distances.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from errormotion.arrays import Array
-from errormotion.errors import MethodError
 from errormotion.estimation.normal import SingularError, factorised
 from errormotion.kinematics.twists import rigid_motions
-from errormotion.methods.multilateration.network.diagnosis import determinacy
-from errormotion.methods.multilateration.network.diagnosis.weakness import FLAT, datum_targets
-from errormotion.methods.multilateration.network.model import Sources, Stations, readings
-from errormotion.methods.multilateration.network.network import Network
-from errormotion.methods.multilateration.network.solver import at_truth
-
-
-def bound(
-    target: ArrayLike,
-    station: ArrayLike,
-    *,
-    noise: ArrayLike = 1e-6,
-    seen: ArrayLike | None = None,
-    sources: Sources | None = None,
-) -> Network:
-    """Return the network of error-free readings with the expected covariances.
-
-    Parameters
-    ----------
-    target : array_like (m, 3)
-        m.
-    station : array_like (n, 3)
-        m.
-    noise : array_like (), (n,) or (n, m)
-        Standard deviation of a reading, m.
-    seen : array_like of bool (n, m), optional
-        Which readings exist; default: all.
-    sources : Sources, optional
-        What is uncertain besides.
-
-    Raises
-    ------
-    MethodError
-        Positions with an undetermined freedom.
-    """
-    u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
-    if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:
-        raise MethodError(f"Expected positions (target, 3) and (station, 3); found {u.shape} and {U.shape}.")
-    if not (np.isfinite(u).all() and np.isfinite(U).all()):
-        raise MethodError("Expected finite positions of targets and stations; found NaN or infinite ones.")
-    stations = Stations(U, np.zeros(len(U)))
-    d = readings(u, stations)
-    if seen is not None:
-        d = np.where(np.asarray(seen, dtype=bool), d, np.nan)
-    return at_truth(d, noise, u, stations, sources)
+from errormotion.methods.multilateration import determinacy
+from errormotion.methods.multilateration.start import Stations
 
 
 @np.errstate(all="ignore")
@@ -74,7 +29,7 @@ def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array
     E = weight[:, :, None] * e
     B = np.concatenate([-E, -weight[:, :, None]], axis=2)
     T = np.einsum("jta,jtb->tab", E, E)
-    whole = np.linalg.det(T) > FLAT * np.trace(T, axis1=1, axis2=2) ** 3
+    whole = ~determinacy.lost_targets(weight > 0, e, 1.0 / weight)
     T[~whole], B = np.eye(3), B * whole[:, None]
     G = np.einsum("jta,jtb->tajb", E, B).reshape(m, 3, 4 * n)
     D = np.zeros((n, 4, n, 4))
@@ -84,10 +39,7 @@ def predicted_uncertainty(weight: Array, station: Array, target: Array) -> Array
         normal = factorised([T], G, D.reshape(4 * n, 4 * n), stations.motions(target.mean(axis=0)).reshape(4 * n, 6))
     except SingularError:
         return None
-    own = normal.own
-    used = whole & datum_targets(np.where(whole, np.trace(own, axis1=1, axis2=2), np.inf))
-    if np.count_nonzero(used) < 3:
-        return None
+    own, used = normal.own, whole
     information, basis = determinacy.without_motions(normal.S, normal.F[used], stations, target[used])
     if determinacy.freedoms(information, basis, station, target[used])[3].any():
         return None

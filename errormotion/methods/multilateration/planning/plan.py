@@ -3,125 +3,127 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from errormotion.arrays import Array
-from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.units import format_quantity
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.expansion import expected_sources
-from errormotion.methods.multilateration.identification.uncertainty import Scatter, parts
-from errormotion.methods.multilateration.names import station_names, target_names
+from errormotion.methods.multilateration.networks import bound
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.bound import bound
+from errormotion.methods.multilateration.planning.bound import predicted_uncertainty
 from errormotion.methods.multilateration.planning.sight import Sight
 from errormotion.methods.multilateration.planning.target_plan import Choice, choose
 from errormotion.methods.multilateration.planning.text import layout_text, map_text
+from errormotion.methods.multilateration.readings import station_names, target_names
+from errormotion.methods.multilateration.schema import SCHEMA
+from errormotion.methods.multilateration.start import Stations, readings
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from errormotion.methods.multilateration.network.network import Network
     from errormotion.methods.multilateration.settings import Planning, Settings
-    from errormotion.plugins import MethodInfo
 
 SETUPS = ("as set", "best")
 _COARSE = 4
 """Targets along each axis for the search of positions: the largest uncertainties are at the faces."""
 
 
-def plan(info: MethodInfo, settings: Settings, planning: Planning | None = None) -> xr.Dataset:
-    """Return an error dataset of zeros with the expected covariance of the layout of the settings.
+def expected(settings: Settings) -> xr.Dataset:
+    """Return the raw data of the layout of the settings without errors and noise, each target visited once."""
+    p = settings.layout
+    target = layout.grid(p)[1]
+    own = np.array(p.stations, np.float64)
+    seen = Sight.of(settings.planning).sees(own, target)
+    d = np.where(seen, readings(target, Stations(own, np.zeros(len(own)))), np.nan)
+    m, vector = {"units": "m"}, ("target", "direction")
+    variables = {
+        "displacement": (("station", "target"), d, m),
+        "target_nominal": (vector, target, m),
+        "station_nominal": (("station", "direction"), own, m),
+        "reflector": (vector, np.tile(p.reflector, (len(target), 1)), m),
+        "displacement_noise": ((), p.displacement_noise, m),
+    }
+    if (e := settings.expansion) is not None:
+        warm = e.reference if e.temperature is None else e.temperature
+        variables["scale_temperature"] = (("station", "direction"), np.full(own.shape, warm), {"units": "degC"})
+    coords = {"station": station_names(len(own)), "target": target_names(len(target)), "direction": list("xyz")}
+    attrs = {"schema": SCHEMA, "machine": "plan"} | ({"chain": settings.chain} if settings.chain else {})
+    return xr.Dataset(variables, coords, attrs)
+
+
+def with_best_layout(planned: xr.Dataset, settings: Settings, planning: Planning) -> xr.Dataset:
+    """Return the plan of the layout of the settings with the best layout.
 
     Further variables; standard uncertainties are those of three coordinates together, by the readings only, m:
     ``target_uncertainty`` (target) of the layout as set; ``map_uncertainty`` (setup, place) at ``map_position``
     (place, direction), as set and with the best layout; ``largest_uncertainty`` and ``mean_uncertainty`` (setup) of
-    that map; ``gain``, the ratio of the minimised uncertainty, as set over best; ``station_place`` and ``best_place``
-    (station, direction), m; ``sees`` (station, target) and ``best_sees`` (station, place). If targets are chosen, the
-    map is over the candidates, and ``chosen`` (place) is 1 for those to measure. The attribute ``best_layout`` is the
-    best layout as settings of a campaign; ``notes`` describe the plan.
+    that map; ``gain``, the ratio of the minimised uncertainty, as set over best; ``best_place`` (station, direction),
+    m; ``sees`` (station, target) and ``best_sees`` (station, place). If targets are chosen, the map is over the
+    candidates, and ``chosen`` (place) is 1 for those to measure. The attribute ``best_layout`` is the best layout as
+    settings of a campaign; ``notes`` describe the plan.
 
     Parameters
     ----------
-    info : MethodInfo
-        Of the method.
+    planned : Dataset
     settings : Settings
-    planning : Planning, optional
-        Boxes, obstacles, reflector, and the minimised quantity; default: those of the settings.
+    planning : Planning
+        Boxes, obstacles, reflector, and the minimised quantity.
 
     Raises
     ------
     MethodError
-        The layout has an undetermined freedom, or no positions within the boxes determine the targets.
+        No positions within the boxes determine the targets.
     """
     p = settings.layout
-    planning = planning or settings.planning
     position, target = layout.grid(p)
     sight = Sight.of(planning)
     own = np.array(p.stations, np.float64)
     noise = reading_noise(settings)
     sees = sight.sees(own, target)
-    expected = bound(target, own, noise=noise, seen=sees, sources=expected_sources(settings, position, target))
-    sigma = layout.uncertainty(expected.target_covariance)
+    sigma = _uncertainty(own, target, sees, noise)
     if planning.targets is None:
-        found = _best_stations(settings, planning, sight, own, expected)
+        found = _best_stations(settings, planning, sight, own, sigma)
     else:
         found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own, target), noise)
     gain = _minimised(planning, found.own) / _minimised(planning, found.best) if found.better else 1.0
     text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
     if planning.write is not None:
         _write(planning.write, text)
-    machine = 0.0 if settings.together else settings.repeatability or 0.0
-    of = parts(expected, 1.0, Scatter(p.displacement_noise, machine))
-    if settings.together and settings.repeatability:  # one visit, common to all stations
-        of.covariance[:, :3, :3] += settings.repeatability**2 * np.eye(3)
-    errors = np.zeros((len(target), 6))
-    errors[:, 3:] = np.nan
-    errors[~np.isfinite(sigma)] = np.nan
     m = {"units": "m"}
-    coords = {name: ("target", position[:, i], m) for i, name in enumerate("xyz")}
-    ds = build_errors(
-        errors,
-        of.covariance,
-        dims=("target",),
-        coords={
-            **coords,
-            "target": target_names(len(target)),
-            "station": station_names(len(own)),
-            "direction": list("xyz"),
-            "setup": list(SETUPS),
-        },
-        component="tool",
-        machine="plan",
-        frame="machine",
-        functional_point=np.array(p.reflector),
-        reference="planned, not measured",
-        method=info.id,
-        method_version=info.version,
-        provenance=provenance.make(settings, None, None, steps=["plan"]),
-        influence=of.influence,
-        sources=of.names,
-        source_groups=of.groups,
-        extras={
-            "target_uncertainty": xr.DataArray(sigma, dims="target", attrs=m),
-            "map_position": xr.DataArray(found.position, dims=("place", "direction"), attrs=m),
-            "map_uncertainty": xr.DataArray(np.stack([found.own, found.best]), dims=("setup", "place"), attrs=m),
-            **_chosen(planning, found),
-            "station_place": xr.DataArray(own, dims=("station", "direction"), attrs=m),
-            "best_place": xr.DataArray(found.station, dims=("station", "direction"), attrs=m),
-            "sees": xr.DataArray(sees.astype(np.int8), dims=("station", "target")),
-            "best_sees": xr.DataArray(found.sees.astype(np.int8), dims=("station", "place")),
-            "largest_uncertainty": xr.DataArray([np.nanmax(s) for s in (found.own, found.best)], dims="setup", attrs=m),
-            "mean_uncertainty": xr.DataArray([np.nanmean(s) for s in (found.own, found.best)], dims="setup", attrs=m),
-            "gain": xr.DataArray(gain, attrs={"units": "1"}),
-        },
-    )
-    return ds.assign_attrs(notes=_notes(sigma, found, sees, gain, planning, position), best_layout=text)
+    further = {
+        "target_uncertainty": ("target", sigma, m),
+        "map_position": (("place", "direction"), found.position, m),
+        "map_uncertainty": (("setup", "place"), np.stack([found.own, found.best]), m),
+        **_chosen(planning, found),
+        "best_place": (("station", "direction"), found.station, m),
+        "sees": (("station", "target"), sees.astype(np.int8)),
+        "best_sees": (("station", "place"), found.sees.astype(np.int8)),
+        "largest_uncertainty": ("setup", [np.nanmax(s) for s in (found.own, found.best)], m),
+        "mean_uncertainty": ("setup", [np.nanmean(s) for s in (found.own, found.best)], m),
+        "gain": ((), gain, {"units": "1"}),
+    }
+    notes = _notes(sigma, found, sees, gain, planning, position)
+    return planned.assign(further).assign_coords(setup=list(SETUPS)).assign_attrs(notes=notes, best_layout=text)
+
+
+def _uncertainty(station: Array, target: Array, sees: NDArray[np.bool_], noise: float) -> Array:
+    """Return the standard uncertainties of targets by the readings, (m,), m.
+
+    Raises
+    ------
+    MethodError
+        Positions with an undetermined freedom.
+    """
+    found = predicted_uncertainty(sees / noise, station, target)
+    if found is None:
+        bound(target, station, noise=noise, seen=sees)
+        raise MethodError("The distances do not determine stations and targets. Distribute them more widely.")
+    return found
 
 
 def reading_noise(settings: Settings) -> float:
@@ -165,7 +167,7 @@ def _minimised(planning: Planning, sigma: Array) -> float:
     return float(np.nanmax(sigma) if planning.minimise == "largest" else np.nanmean(sigma))
 
 
-def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Array, expected: Network) -> Choice:
+def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Array, here: Array) -> Choice:
     """Return the best stations and the uncertainty at the targets; the layout as set if none are better."""
     p, noise = settings.layout, reading_noise(settings)
     position, target = layout.grid(p)
@@ -179,8 +181,7 @@ def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Ar
         minimise=planning.minimise,
     )
     seen = sight.sees(station, target)
-    best = bound(target, station, noise=noise, seen=seen)
-    there, here = (layout.uncertainty(network.target_covariance) for network in (best, expected))
+    there = _uncertainty(station, target, seen, noise)
     found = Choice(position, np.arange(len(target)), station, here, there, here, seen)
     unseen = np.isnan(here).sum() - np.isnan(there).sum()
     if unseen > 0 or _minimised(planning, there) < _minimised(planning, here):
@@ -188,14 +189,14 @@ def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Ar
     return replace(found, station=own, best=here, sees=sight.sees(own, target))
 
 
-def _chosen(planning: Planning, found: Choice) -> dict[str, xr.DataArray]:
+def _chosen(planning: Planning, found: Choice) -> dict[str, Any]:
     """Return the variable of the candidates to measure, if targets are chosen."""
     if planning.targets is None:
         return {}
     chosen = np.zeros(len(found.position), np.int8)
     chosen[found.chosen] = 1
     about = {"long_name": "1: to be measured", "of": planning.targets.uncertainty}
-    return {"chosen": xr.DataArray(chosen, dims="place", attrs=about)}
+    return {"chosen": ("place", chosen, about)}
 
 
 def _write(path: Path, text: str) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.methods.multilateration.networks import bound
 from errormotion.methods.multilateration.planning import layout
-from errormotion.methods.multilateration.planning.bound import bound
 from errormotion.methods.multilateration.planning.choosing import positions, refuse_count
 from errormotion.methods.multilateration.planning.target_sets import POWERS, Expected, Volume
 

@@ -24,8 +24,8 @@ import numpy as np
 from errormotion.arrays import Array
 from errormotion.kinematics.twists import rigid_motions
 from errormotion.kinematics.volumes import Term, first_order, is_rotation
-from errormotion.methods.multilateration.identification.parameters import volume_of
-from errormotion.methods.multilateration.network.model import Stations, directions
+from errormotion.methods.multilateration.axes import volume_of
+from errormotion.methods.multilateration.start import Stations, directions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

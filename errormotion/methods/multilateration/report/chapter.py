@@ -20,8 +20,10 @@ from errormotion.report.text import DASH, finite, fixed, integer, significant
 __all__ = ["is_multilateration", "part"]
 
 _OWN = "noise of the target's own readings"
-_TRACKER = "stations"
-_WORDS = {_TRACKER: "stations, by the tracker's noise", "repeatability": "repeatability of the machine"}
+_WORDS = {
+    "stations": "stations, by the noise of the readings",
+    "targets": "targets that define the datum, by the noise of the readings",
+}
 _UNKNOWN = "not determined at any target"
 _RIGID_MOTIONS = (
     "Distances determine only the positions of the targets relative to one another. The six rigid motions of the "
@@ -144,9 +146,7 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     if "influence" not in errors or not np.isfinite(sigma).any():
         return [*found, Text("The result does not state the sources of its uncertainty.", "note")]
     worst = int(np.nanargmax(sigma))
-    table = budget.table(
-        _parted(errors.isel(target=worst)), f"at {net.targets[worst]}, the target with the largest uncertainty"
-    )
+    table = budget.table(errors.isel(target=worst), f"at {net.targets[worst]}, the target with the largest uncertainty")
     own = budget.readable("independent")
     rows = [[_WORDS.get(str(row[0]), _OWN if row[0] == own else row[0]), *row[1:]] for row in table.rows]
     found.append(replace(table, rows=rows))
@@ -154,31 +154,6 @@ def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
     if shared:
         found.append(Text(f"Of the variance of that target, {shared} is shared with other targets.", "plain"))
     return found
-
-
-def _parted(here: xr.Dataset) -> xr.Dataset:
-    """Return a result at one target with the covariance of its own readings divided by cause (``scatter_share``).
-
-    The independent part is due to the tracker's noise and the machine's repeatability; the second becomes a group.
-    """
-    shares = here.get("scatter_share")
-    if shares is None or shares.dims != ("cause",) or shares.size < 2:
-        return here
-    C = np.asarray(here["covariance"].transpose("dof", "dof_").values, float)[:3, :3]
-    F = np.asarray(here["influence"].transpose("source", "dof").values, float)
-    values, vectors = np.linalg.eigh(C - F[:, :3].T @ F[:, :3])
-    rows, groups = [], []
-    for cause, share in zip(shares["cause"].values, shares.values, strict=True):
-        if str(cause) == _TRACKER:
-            continue
-        for value, vector in zip(values, vectors.T, strict=True):
-            rows.append(np.append(np.sqrt(max(value, 0.0) * float(share)) * vector, np.full(3, np.nan)))
-            groups.append(str(cause))
-    names = [*here["source"].values.tolist(), *(f"own.{k}" for k in range(len(rows)))]
-    all_groups = [*here["source_group"].values.tolist(), *groups]
-    without = here.drop_dims("source")
-    parted = without.assign_coords(source=names, source_group=("source", all_groups))
-    return parted.assign(influence=(("source", "dof"), np.concatenate([F, rows])))
 
 
 def _shared(errors: xr.Dataset) -> str:
@@ -190,6 +165,19 @@ def _shared(errors: xr.Dataset) -> str:
     influence = np.asarray(errors["influence"].isel(target=worst).transpose("source", "dof").values, float)[:, :3]
     share = float(np.nansum(influence**2) / trace[worst])
     return f"{fixed(100 * min(share, 1.0), 0)} %" if math.isfinite(share) else ""
+
+
+def _shares(errors: xr.Dataset) -> list[tuple[str, str]]:
+    """Return the share of each cause in the variance of a reading, if there are several."""
+    found = errors.get("scatter_share")
+    if found is None or found.dims != ("cause",) or found.size < 2:
+        return []
+    names = {"stations": "tracker", "repeatability": "repeatability of the machine"}
+    causes = [str(cause) for cause in found["cause"].values]
+    return [
+        (f"share of the {names.get(cause, cause)} in the variance of a reading / %", fixed(100 * float(share), 0))
+        for cause, share in zip(causes, found.values, strict=True)
+    ]
 
 
 def _remarks(errors: xr.Dataset) -> list[Block]:
@@ -204,6 +192,7 @@ def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
         ("condition of the determined freedoms", significant(scalar(errors, "condition"), 3)),
         ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
         ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
+        *_shares(errors),
     ]
     rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]
     found = [*_remarks(errors), *quality.left_out(net)]

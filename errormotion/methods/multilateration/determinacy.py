@@ -8,13 +8,17 @@ stations, or in one plane with all, has a direction in which no distance changes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.errors import MethodError
+from errormotion.errors import FitError, MethodError
+from errormotion.estimation.fit import Fit
+from errormotion.estimation.problem import Problem, linearised
 from errormotion.kinematics.twists import rigid_motions
-from errormotion.methods.multilateration.network.model import Stations
+from errormotion.methods.multilateration.start import Stations
 
 MAX_SHARE = 0.05
 """Standard uncertainty over the distances above which a freedom is undetermined: the model is not linear over it."""
@@ -24,20 +28,31 @@ FLAT = 0.03
 """Thickness over extent below which stations or targets are in a plane, or on a line."""
 WEAK = 20.0
 """Ratio of the uncertainty of a target to the noise from which a note is made."""
+WEAK_POSITION = 10.0
+"""Uncertainty of a target over the median one, with known stations, above which it has no position. Of m targets, one
+with the ratio sqrt(m) does not harm the datum: the limit is half of this if that is larger."""
+SINGULAR = 1e-10
+"""Determinant of the products of a target's directions, over the cube of their trace, without a position."""
+DATUM_SAMPLE = 64
+"""Number of evenly distributed targets whose datum is used to detect undetermined freedoms."""
+NOT_FINITE = (
+    "Expected distances between stations and targets, and a noise, that are not zero; found one of zero, or not "
+    "finite. Check positions and noise, and that both are in metres."
+)
 _TINY = 1e-30
 SAME_DIRECTION = 0.05
 """Angle between the lines of sight of two stations, rad, below which these are in one line with the targets."""
 _DESCRIBED = 3
-_LISTED = 12
 _SHARE = 0.1
 
 
-def refuse_too_few(reading: Array) -> None:
-    """Raise MethodError if there are fewer readings (n, m) than unknowns of the stations."""
-    known = np.isfinite(reading)
-    by_target = known.sum(axis=0)
-    by_station = (known & (by_target >= 3)).sum(axis=1)
-    n, m = len(by_station), len(by_target)
+def refuse_too_few(used: NDArray[np.bool_], approximate: Array | None, target: Array) -> None:
+    """Raise MethodError if the readings that are used (n, m) are fewer than the unknowns of the stations.
+
+    Positions of stations (n, 3) and targets (m, 3), m, are those by which the cause is described, if they are known.
+    """
+    by_target, by_station = used.sum(axis=0), used.sum(axis=1)
+    n, m = used.shape
     if n < 4:
         raise MethodError(
             f"Expected at least four stations; found {n}. With three every target has as many unknowns as distances, "
@@ -47,70 +62,122 @@ def refuse_too_few(reading: Array) -> None:
     if len(blind):
         raise MethodError(
             f"Expected at least 4 readings of every station; found "
-            f"{', '.join(f'{by_station[j]} of station {j + 1}' for j in blind)}. Measure more targets "
-            "from it, or remove the station."
+            f"{', '.join(f'{by_station[j]} of station {j + 1}' for j in blind)} for targets with a position. "
+            + _cause(approximate, target, "Measure more targets from it, or remove the station.")
         )
-    count = by_target
-    equations, needed = int(np.maximum(count - 3, 0).sum()), 4 * n - 6
+    equations, needed = int(np.maximum(by_target - 3, 0).sum()), 4 * n - 6
     if equations < needed:
         full = -(-needed // (n - 3))
         raise MethodError(
             f"Expected at least {full} targets measured from all {n} stations, or an equivalent number of readings, "
             f"for {needed} unknowns of the stations (positions and dead paths); found {equations} equations from {m} "
-            f"targets, {int(np.count_nonzero(count == n))} of them measured from all stations and "
-            f"{int(np.count_nonzero(count < 3))} from fewer than three. Measure more targets."
+            f"targets, {int(np.count_nonzero(by_target == n))} of them measured from all stations and "
+            f"{int(np.count_nonzero(by_target < 3))} without a position. "
+            + _cause(approximate, target, "Measure more targets.")
         )
 
 
-def refuse_not_finite(*values: Array) -> None:
-    """Raise MethodError if values by distances and noise are not finite."""
-    if not all(np.isfinite(each).all() for each in values):
-        raise MethodError(
-            "Expected distances between stations and targets, and a noise, that are not zero; found one of zero, or "
-            "not finite. Check positions and noise, and that both are in metres."
-        )
+def _cause(approximate: Array | None, target: Array, remedy: str) -> str:
+    """Return why targets have no position, where the stations are known, or the remedy."""
+    return remedy if approximate is None else f"{remedy} Possible cause: {_reason(approximate, target)}."
 
 
-def refuse_undetermined(
-    S: Array, F: Array, stations: Stations, target: Array, in_datum: NDArray[np.bool_], approximate: Array, most: int
-) -> Array:
-    """Return the eigenvalues of the stations' information without rigid motions, scaled to a diagonal of 1.
+def lost_targets(known: NDArray[np.bool_], e: Array, sd: Array) -> NDArray[np.bool_]:
+    """Return which targets (m,) have no position: fewer than three readings, or a weakly determined direction.
+
+    A target with three readings nearly in one plane with its stations moves by a millimetre out of that plane while its
+    distances change by a micrometre. It would affect the datum of all.
 
     Parameters
     ----------
-    S : ndarray (q, q)
-        Information of the stations' parameters and of further ones, 1/m^2.
-    F : ndarray (m, 3, q)
-        Negative motion of the targets by these parameters, m.
-    stations : Stations
-        As estimated.
-    target : ndarray (m, 3)
-        As estimated, m.
-    in_datum : ndarray of bool (m,)
-        Targets that define the datum. In the datum of ``most`` of these an undetermined station moves alone.
-    approximate : ndarray (n, 3)
-        Approximate positions of the stations, m: the estimated ones are wrong if a freedom is undetermined.
+    known : ndarray of bool (n, m)
+        Readings.
+    e : ndarray (n, m, 3)
+        Unit vectors from stations to targets.
+    sd : ndarray (n, m)
+        Standard deviations, m.
 
     Raises
     ------
-    MethodError
-        A freedom is undetermined.
+    FitError
+        Directions or standard deviations are not finite.
     """
-    refuse_not_finite(S, target)
-    some = np.flatnonzero(in_datum)
-    some = some[:: max(1, len(some) // most)]
+    with np.errstate(all="ignore"):
+        E = np.where(known, 1.0 / sd, 0.0)[..., None] * e
+        A = np.einsum("jta,jtb->tab", E, E)
+        few = np.count_nonzero(known, axis=0) < 3
+        A[few] = np.eye(3)
+        if not np.isfinite(A).all():
+            raise FitError(NOT_FINITE)
+        # sum(1 / eigenvalue) = second invariant / determinant
+        trace, determinant = np.trace(A, axis1=1, axis2=2), np.linalg.det(A)
+        second = (trace**2 - np.einsum("tab,tab->t", A, A)) / 2
+        square = np.where(determinant > SINGULAR * trace**3, second / determinant, np.inf)
+        u = np.sqrt(np.where(few, np.nan, square))
+    if few.all():
+        return np.asarray(few)
+    limit = max(WEAK_POSITION, 0.5 * np.sqrt(len(u))) * float(np.median(u[~few]))
+    return np.asarray(few | ~np.isfinite(u) | (u > limit))
+
+
+def condition(fit: Fit, approximate: Array) -> float:
+    """Return the condition of the stations' information without rigid motions, scaled to a diagonal of 1.
+
+    Raises
+    ------
+    FitError
+        A freedom is undetermined; it is described, with its cause by the approximate stations (n, 3), m.
+    """
+    x, free = fit.unknowns, fit.problem.unknowns.target.freed[:, 0]
+    stations = Stations(x.station[:, :3], x.station[:, 3])
+    found = _freedoms(fit.normal.S, fit.normal.F, stations, x.target, free)
+    if found[3].any():
+        raise FitError(_described(found, stations, x.target[free], approximate))
+    return float(found[0][-1] / found[0][0])
+
+
+def undetermined(problem: Problem, approximate: Array) -> str:
+    """Return what the readings of a problem leave undetermined, and why; see `condition`."""
+    linear = linearised(problem, problem.start)
+    [T], G, D = linear.sums()
+    free = problem.unknowns.target.freed[:, 0]
+    F = np.where(free[:, None, None], np.linalg.pinv(T, hermitian=True) @ G, 0.0)
+    S = D + np.diag(linear.border_prior()[0]) - np.tensordot(G, F, axes=((0, 1), (0, 1)))
+    target, station = linear.at.tables[:2]
+    stations = Stations(station[:, :3], station[:, 3])
+    found = _freedoms(S, F, stations, target, free)
+    if not found[3].any():
+        return "The distances do not determine stations and targets. Distribute them more widely."
+    return _described(found, stations, target[free], approximate)
+
+
+def _freedoms(
+    S: Array, F: Array, stations: Stations, target: Array, free: NDArray[np.bool_]
+) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return the freedoms (`freedoms`) of information S (q, q), by which targets move by -F (m, 3, q).
+
+    In the datum of a few targets an undetermined station moves alone.
+    """
+    if not (np.isfinite(S).all() and np.isfinite(target).all()):
+        raise FitError(NOT_FINITE)
+    some = np.flatnonzero(free)
+    some = some[:: max(1, len(some) // DATUM_SAMPLE)]
     information, basis = without_motions(S, F[some], stations, target[some])
-    values, motions, sigma, undetermined = freedoms(information, basis, stations.position, target[some])
-    if not undetermined.any():
-        return values
-    centre = target[some].mean(axis=0)
-    k = int(np.count_nonzero(undetermined))
-    named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(undetermined)[:_DESCRIBED])
+    return freedoms(information, basis, stations.position, target[some])
+
+
+def _described(
+    found: tuple[Array, Array, Array, NDArray[np.bool_]], stations: Stations, target: Array, approximate: Array
+) -> str:
+    """Return the undetermined freedoms as text, with the cause."""
+    values, motions, sigma, lost = found
+    k, centre = int(np.count_nonzero(lost)), target.mean(axis=0)
+    named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(lost)[:_DESCRIBED])
     worst = sigma[0] if values[0] > ROUNDING * values[-1] else np.inf
-    raise MethodError(
+    return (
         f"Expected positions of stations and targets that the distances determine; found {k} "
         f"undetermined {'freedom' if k == 1 else 'freedoms'} (standard uncertainty {_length(worst)}): {named}. "
-        f"Cause: {_reason(approximate, target[some])}."
+        f"Cause: {_reason(approximate, target)}."
     )
 
 
@@ -211,82 +278,27 @@ def _reason(position: Array, target: Array) -> str:
     return "; ".join(found)
 
 
-def refuse_flat(determined: int, approximate: Array, target: Array) -> None:
-    """Raise MethodError if fewer than three targets have a position: the datum is not determined."""
-    if determined < 3:
-        raise MethodError(
-            f"Expected stations on all sides of the targets; found {determined} of {len(target)} targets with a "
-            "position determined by the distances: each of the others is in one plane with its stations. "
-            f"Cause: {_reason(approximate, target)}."
-        )
+def weak_layout(own: Array, shared: Sequence[Array], noise: float, approximate: Array, target: Array) -> list[str]:
+    """Return a note if the layout amplifies the noise of a reading much.
 
-
-def weak_layout(covariance: Array, weight: Array, position: Array, target: Array) -> list[str]:
-    """Return a note if the layout amplifies the noise much, by covariances (m, 3, 3) and weights (n, m)."""
-    trace = np.trace(covariance, axis1=1, axis2=2)
+    Parameters
+    ----------
+    own, shared : ndarray (m, 3, 3), sequence of ndarray (m, 3)
+        Covariances by the readings of each target, m^2, NaN if unknown, and effects that targets have in common, m.
+    noise : float
+        m.
+    approximate, target : ndarray (n, 3), (m, 3)
+        Stations and targets, m.
+    """
+    trace = np.trace(own, axis1=1, axis2=2) + sum(np.sum(np.square(each), axis=1) for each in shared)
     known = np.isfinite(trace)
-    factor = float(np.sqrt(np.median(trace[known]) / 3) * np.median(weight[weight > 0]))
+    factor = float(np.sqrt(np.median(trace[known]) / 3)) / noise
     if factor < WEAK:
         return []
     return [
-        f"In this layout the standard uncertainty of a target in each direction is {factor:.3g} times the noise of a "
-        f"reading: {_reason(position, target[known])}."
+        f"In this layout the standard uncertainty of a target in each direction is {factor:.3g} times the noise of "
+        f"a reading: {_reason(approximate, target[known])}."
     ]
-
-
-def outside_datum(in_datum: NDArray[np.bool_], target: Array) -> list[str]:
-    """Return a note on the targets (m, 3) that have a position but do not define the datum."""
-    weak = np.flatnonzero(~in_datum & np.isfinite(target[:, 0]))
-    if not len(weak):
-        return []
-    return [f"Weakly determined targets, not used for the datum ({len(weak)}): {_listed(weak)}."]
-
-
-def without_position(weight: Array, named: tuple[int, ...]) -> list[str]:
-    """Return a note on the targets with too few readings, by weight (n, m), except those already ``named``."""
-    few = np.setdiff1d(np.flatnonzero(np.count_nonzero(weight, axis=0) < 3), named)
-    if not len(few):
-        return []
-    return [
-        "Targets with fewer than three valid readings, or in one plane with their stations, without a position "
-        f"({len(few)}): {_listed(few)}."
-    ]
-
-
-def _listed(targets: NDArray[np.intp]) -> str:
-    """Return the numbers of the first targets, and how many more there are."""
-    more = f" and {len(targets) - _LISTED} more" if len(targets) > _LISTED else ""
-    return f"{', '.join(str(i + 1) for i in targets[:_LISTED])}{more}"
-
-
-def weak_targets(target: Array, covariance: Array, position: Array) -> list[str]:
-    """Return notes on targets (m, 3) with a weakly determined direction, by their covariances (m, 3, 3)."""
-    trace = np.trace(covariance, axis1=1, axis2=2)
-    known = np.isfinite(trace)
-    if not known.any():
-        return []
-    weak = np.flatnonzero(known & (trace > WEAK**2 * np.median(trace[known])))
-    notes = []
-    for i in weak[:_DESCRIBED]:
-        values, vectors = np.linalg.eigh(covariance[i])
-        direction = ", ".join(f"{c:+.2f}" for c in vectors[:, -1])
-        notes.append(
-            f"Target {i + 1} is weakly determined along ({direction}), with a standard uncertainty of "
-            f"{np.sqrt(values[-1]) * 1e3:.3g} mm: {_of_target(target[i], position)}."
-        )
-    if len(weak) > _DESCRIBED:
-        notes.append(f"Further targets with a weakly determined direction: {len(weak) - _DESCRIBED}.")
-    return notes
-
-
-def _of_target(target: Array, position: Array) -> str:
-    sight = target - position
-    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    for j in range(len(position)):
-        for k in range(j + 1, len(position)):
-            if np.linalg.norm(np.cross(sight[j], sight[k])) < SAME_DIRECTION:
-                return f"it is in one line with stations {j + 1} and {k + 1}"
-    return "it is nearly in one plane with its stations"
 
 
 def swapped_stations(found: Array, approximate: Array | None) -> list[tuple[int, int]]:

@@ -15,10 +15,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.estimation.robust import scale_about_zero
+from errormotion.kinematics.twists import rigid_motions
 
 MAX_READINGS = 150
 """Maximum number of readings of a station used for its start value."""
@@ -26,6 +28,8 @@ FLAT = 1e-3
 """Thickness over extent below which targets are in a plane, or on a line."""
 MAX_MISFIT = 0.01
 """Misfit of a station's readings to the nominal targets, over their extent, above which they are refused."""
+GROSS = 50.0
+"""Contradiction of a reading to the commanded positions, over the usual one of its station, above which it is wrong."""
 _GOOD_FIT = 1e-3  # over the extent, below which no further start value is tried
 _MAX_STEPS = 30
 _REWEIGHTINGS = 8
@@ -33,14 +37,36 @@ _DRAWS, _DRAWN = 60, 8
 
 
 @dataclass(frozen=True)
-class Start:
-    """Approximate positions (n, 3) and dead paths (n,) of the stations, m."""
+class Stations:
+    """Positions (n, 3) and dead paths (n,) of the stations, m."""
 
     position: Array
     dead_path: Array
 
+    @property
+    def table(self) -> Array:
+        """Positions and dead paths, (n, 4)."""
+        return np.column_stack([self.position, self.dead_path])
 
-def initial_stations(reading: Array, weight: Array, target: Array, station: Array | None) -> Start:
+    def motions(self, centre: Array) -> Array:
+        """Return the effect (n, 4, 6) of rigid motions of the network about ``centre`` on positions and dead paths."""
+        T = np.zeros((len(self.position), 4, 6))
+        T[:, :3] = rigid_motions(self.position, centre)
+        return T
+
+
+def readings(target: Array, stations: Stations) -> Array:
+    """Return the displacements (n, m), m, of targets (m, 3) from stations."""
+    return np.asarray(np.linalg.norm(target - stations.position[:, None], axis=-1) - stations.dead_path[:, None])
+
+
+def directions(target: Array, position: Array) -> Array:
+    """Return the unit vectors (n, m, 3) from stations at positions (n, 3) to targets (m, 3)."""
+    v = target - position[:, None]
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True), dtype=float)
+
+
+def initial_stations(reading: Array, weight: Array, target: Array, station: Array | None) -> Stations:
     """Return approximate stations from readings (n, m) of nominal targets (m, 3).
 
     Raises
@@ -67,7 +93,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     if normal is None and _from_good_readings(
         reading, weight, target, centre, _GOOD_FIT * extent, positions, dead_paths
     ):
-        return Start(positions, dead_paths)
+        return Stations(positions, dead_paths)
     for j in range(n):
         d, u = _selected(reading[j], weight[j], target, centre, MAX_READINGS)
         approximate = None if station is None or not np.isfinite(station[j]).all() else station[j] - centre
@@ -85,7 +111,21 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
         if scale > MAX_MISFIT * extent or _reversed(d, u, found, normal, scale):
             raise MethodError(_misfit_message(j, d, u, extent, scale))
         positions[j], dead_paths[j] = found[:3] + centre, found[3]
-    return Start(positions, dead_paths)
+    return Stations(positions, dead_paths)
+
+
+def gross(reading: Array, nominal: Array, stations: Stations, noise: float) -> NDArray[np.bool_]:
+    """Return the readings (n, m) that contradict the commanded positions far more than others of their station.
+
+    With four stations the residuals of a target are equal whichever of its readings is wrong; its commanded position,
+    from which a machine is off by little, shows which. It has no rate of false alarms: valid readings never differ as
+    much. Smaller outliers are found by the residuals.
+    """
+    off = np.empty_like(reading)
+    for j in range(len(reading)):
+        off[j] = np.abs(np.linalg.norm(nominal - stations.position[j], axis=1) - stations.dead_path[j] - reading[j])
+    usual = np.nanmedian(off, axis=1, keepdims=True)
+    return np.asarray(off > GROSS * np.maximum(usual, noise))
 
 
 def _spread(count: int, most: int) -> slice:

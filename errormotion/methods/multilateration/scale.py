@@ -12,17 +12,17 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.multilateration.identification.refraction import (
+from errormotion.methods.multilateration.model import Shared
+from errormotion.methods.multilateration.refraction import (
     index_uncertainty,
     refractive_index,
     sensitivities,
 )
-from errormotion.methods.multilateration.network.model import SCALES, Shared, Sources, directions
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from errormotion.methods.multilateration.settings import Air, Expansion, Settings
+    from errormotion.methods.multilateration.settings import Air, Expansion
 
 LABORATORY = (20.0, 101325.0, 0.5)
 """Temperature (degC), pressure (Pa) and humidity at which the effect of an unrecorded state of the air is computed."""
@@ -139,27 +139,11 @@ def expansion_sources(excess: Array, position: Array, e: Array, expansion: Expan
     changes = [
         Shared(
             "coefficient of expansion",
-            SCALES,
             along_beams(expansion.coefficient_uncertainty * excess, centred, e),
         )
     ]
     for k, axis in enumerate("XYZ"):
         strain = np.zeros_like(excess)
         strain[:, k] = expansion.coefficient * expansion.temperature_uncertainty
-        changes.append(Shared(f"scale temperature {axis}", SCALES, along_beams(strain, centred, e)))
+        changes.append(Shared(f"scale temperature {axis}", along_beams(strain, centred, e)))
     return [shared for shared in changes if np.nanmax(np.abs(shared.change)) > 0]
-
-
-def expected_sources(settings: Settings, position: Array, target: Array) -> Sources:
-    """Return what will be uncertain, besides the noise, in a measurement of the layout of the settings.
-
-    Axis positions and targets are (m, 3), m. The air is that of a laboratory; without a stated temperature of the
-    scales, the one that will be measured is taken as the reference.
-    """
-    scales: list[Shared] = []
-    station = np.array(settings.layout.stations, dtype=float)
-    if (e := settings.expansion) is not None:
-        excess = np.full((len(station), 3), 0.0 if e.temperature is None else e.temperature - e.reference)
-        scales = expansion_sources(excess, position, directions(target, station), e)
-    air = causes(*LABORATORY, settings.air.wavelength, settings.air)
-    return Sources(air, {"tracker scale": settings.scale_or_assumed}, scales)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import chdtri, fdtri
 
 from errormotion.arrays import Array
-from errormotion.methods.multilateration.network.model import DRIFT, Shared
+from errormotion.methods.multilateration.model import Shared
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -203,5 +203,5 @@ def _sources(name: str, j: int, terms: Array, C: Array, shape: tuple[int, int]) 
     for k, value in enumerate(values):
         change = np.zeros(shape)
         change[j] = terms @ vectors[:, k] * np.sqrt(value)
-        sources.append(Shared(f"drift at station {name}.{k}", DRIFT, change))
+        sources.append(Shared(f"drift at station {name}.{k}", change))
     return sources

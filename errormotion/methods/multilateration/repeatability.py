@@ -16,22 +16,30 @@ of the network estimate it as well; both are weighted by their variances.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import chdtri, fdtri, ndtri
+from scipy.special import ndtri
 
-from errormotion.methods.multilateration.identification.uncertainty import Scatter
+from errormotion.arrays import Array
+from errormotion.estimation.variance import Verdict
+from errormotion.methods.multilateration.model import XYZ
+from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
+    import xarray as xr
     from numpy.typing import NDArray
 
-    from errormotion.methods.multilateration.identification.drift import Drift
-    from errormotion.methods.multilateration.network.network import Network
+    from errormotion.estimation.variance import Scatter
+    from errormotion.measurement.observed import Solved
+    from errormotion.methods.multilateration.drift import Drift
 
 FALSE_ALARM = 1e-3
-"""Probability that readings with the stated repeatability are reported as contradicting it."""
+"""Probability that returns with the stated repeatability are reported as contradicting it."""
+NEGLIGIBLE = 1e-6
+"""Variance, relative to that of the tracker, that is no cause of its own."""
+REPEATABILITY, UNEXPLAINED = "repeatability", "unexplained scatter"
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,18 @@ class Repeatability:
         low, high = (np.sqrt(max(self.variance + sign * self.spread, 0.0)) for sign in (-1, 1))
         return float(high - low) / 2
 
+    def freedom(self, tracker: float) -> float:
+        """Return the degrees of freedom of the variance of a reading, with the noise of the tracker, m."""
+        return 2 * ((self.variance + tracker**2) / self.spread) ** 2 if self.spread > 0 else np.inf
+
+    def with_residuals(self, tracker: float, scatter: Scatter) -> Repeatability:
+        """Return the repeatability with what the residuals say, if both agree."""
+        if not np.isfinite(scatter.freedom) or scatter.verdict is Verdict.MORE or self.spread == 0:
+            return self
+        total = (self.variance + tracker**2) * scatter.factor
+        spread = total * float(np.sqrt(2 / scatter.freedom))
+        return Repeatability(max(total - tracker**2, 0.0), spread, (*self.sources, "residuals"))
+
 
 def stated(value: float | None, uncertainty: float) -> Repeatability:
     """Return the repeatability of the settings, m."""
@@ -94,74 +114,46 @@ def from_returns(before: Repeatability, drift: Drift, tracker: float, used: floa
     """
     if not drift.freedom:
         return before
-    total = used**2 * drift.square / drift.freedom
-    estimated = Repeatability(max(total - tracker**2, 0.0), total * float(np.sqrt(2 / drift.freedom)), ("returns",))
-    return _combined(before, estimated, drift.freedom, tracker, notes)
+    return _combined(before, used**2 * drift.square / drift.freedom, drift.freedom, tracker, notes)
 
 
 def from_positions(
-    before: Repeatability, network: Network, position: NDArray[np.intp], factor: float, notes: list[str]
+    before: Repeatability, target: Array, own: Array, position: NDArray[np.intp], notes: list[str]
 ) -> Repeatability:
-    """Return the repeatability, updated with the positions of returns that all stations read at the same time."""
-    known = np.flatnonzero(np.isfinite(network.target[:, 0]))
+    """Return the repeatability, updated with the positions of returns that all stations read at the same time.
+
+    Targets are (m, 3), m, NaN if unknown, with covariances (m, 3, 3) by their own readings; those with the same number
+    in ``position`` (m,) are returns.
+    """
+    known = np.flatnonzero(np.isfinite(target[:, 0]))
     known = known[np.argsort(position[known], kind="stable")]
     groups = [g for g in np.split(known, np.flatnonzero(np.diff(position[known])) + 1) if len(g) > 1]
     freedom = 3 * sum(len(g) - 1 for g in groups)
     if not freedom:
         return before
-    own = factor**2 * network.fit.normal.own[np.concatenate(groups)]
-    tracker = float(np.sqrt(np.trace(own, axis1=1, axis2=2).mean() / 3))
-    square = sum(float(np.sum((network.target[g] - network.target[g].mean(axis=0)) ** 2)) for g in groups)
-    total = square / freedom
-    estimated = Repeatability(max(total - tracker**2, 0.0), total * float(np.sqrt(2 / freedom)), ("returns",))
-    return _combined(before, estimated, freedom, tracker, notes)
+    tracker = float(np.sqrt(np.trace(own[np.concatenate(groups)], axis1=1, axis2=2).mean() / 3))
+    square = sum(float(np.sum((target[g] - target[g].mean(axis=0)) ** 2)) for g in groups)
+    return _combined(before, square / freedom, freedom, tracker, notes)
 
 
-def explained(
-    before: Repeatability, network: Network, tracker: float, *, increase: bool, together: bool
-) -> tuple[float, Scatter, Repeatability]:
-    """Return the factor for the readings' standard deviation, its parts, and the repeatability with the residuals.
+def shares(before: float, machine: float, tracker: float, solved: Solved) -> dict[str, float]:
+    """Return the share of each cause in the variance of a reading.
 
-    Parameters
-    ----------
-    before : Repeatability
-        Contained in the network's weights, unless ``together``.
-    network : Network
-    tracker : float
-        Noise of the tracker's readings, m.
-    increase : bool
-        Whether to increase the standard deviation if the readings scatter more than expected.
-    together : bool
-        Whether all stations are read at the same time, so that residuals do not depend on the repeatability.
+    Variances by the machine, m^2, are those before the fit and with its residuals; ``tracker`` is a noise, m.
     """
-    machine = 0.0 if together else before.variance
-    variance, freedom = tracker**2 + machine, network.freedom
-    square = network.sigma0**2
-    excess = freedom > 0 and exceeds(network, 0.0 if together else before.spread / variance)
-    if excess and increase:
-        unexplained = float(np.sqrt(variance * (square - 1)))
-        return network.sigma0, Scatter(tracker, float(np.sqrt(machine)), unexplained), before
-    if together or before.spread == 0 or freedom <= 0 or excess:
-        return 1.0, Scatter(tracker, float(np.sqrt(machine))), before
-    weight = np.array([(variance / before.spread) ** 2, freedom / 2])
-    total = max(variance * float(weight @ (1.0, square)) / float(weight.sum()), tracker**2)
-    updated = Repeatability(total - tracker**2, total / float(np.sqrt(weight.sum())), (*before.sources, "residuals"))
-    return float(np.sqrt(total / variance)), Scatter(tracker, float(np.sqrt(updated.variance))), updated
+    rest = (tracker**2 + before) * solved.scatter.factor - tracker**2 - machine
+    rounding = 0.0 if solved.rounding is None else float(np.median(np.square(solved.rounding.sd)))
+    parts = {"stations": tracker**2, REPEATABILITY: machine, UNEXPLAINED: rest, "rounding": rounding}
+    kept = {name: part for name, part in parts.items() if part > NEGLIGIBLE * tracker**2}
+    return {name: part / sum(kept.values()) for name, part in kept.items()}
 
 
-def exceeds(network: Network, relative: float) -> bool:
-    """Return whether the scatter of a network exceeds its noise, whose variance has the uncertainty ``relative``."""
-    freedom = network.freedom
-    # The variance of the noise has f' = 2 / relative^2 degrees of freedom.
-    if relative > 0:
-        return bool(network.sigma0**2 > fdtri(freedom, max(2 / relative**2, 1.0), 1 - FALSE_ALARM))
-    return bool(network.sigma0**2 * freedom > chdtri(freedom, FALSE_ALARM))
+def _combined(before: Repeatability, total: float, freedom: int, tracker: float, notes: list[str]) -> Repeatability:
+    """Return the weighted mean of the stated repeatability and that of returns, whose variance is ``total``, m^2.
 
-
-def _combined(
-    before: Repeatability, estimated: Repeatability, freedom: int, tracker: float, notes: list[str]
-) -> Repeatability:
-    """Return the weighted mean of stated and estimated repeatability, with a note if they contradict one another."""
+    A note is added if they contradict one another.
+    """
+    estimated = Repeatability(max(total - tracker**2, 0.0), total * float(np.sqrt(2 / freedom)), ("returns",))
     if not before.sources:
         return estimated
     variance_of_reading = before.variance + tracker**2
@@ -178,3 +170,14 @@ def _combined(
     weight = np.array([before.spread, estimated.spread]) ** -2.0
     variance = float(weight @ (before.variance, estimated.variance) / weight.sum())
     return Repeatability(variance, float(weight.sum() ** -0.5), ("settings", "returns"))
+
+
+def displaced(redrawing: Redrawing, errors: xr.Dataset) -> Redrawing:
+    """Return sources with the repeatability of positions that all stations read at the same time."""
+    sd = float(errors["repeatability"])
+
+    def act(drawn: xr.Dataset, generator: np.random.Generator) -> xr.Dataset:
+        shift = sd * generator.standard_normal((3, drawn.sizes["target"]))
+        return replaced(drawn, {name: drawn[name].values + d for name, d in zip(XYZ, shift, strict=True)})
+
+    return replace(redrawing, sources={**redrawing.sources, REPEATABILITY: Redraw(act=act, own=True)})

@@ -1,1 +1,0 @@
-"""Identification of volumetric errors: from raw data to errors with covariance."""

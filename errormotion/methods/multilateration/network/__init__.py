@@ -1,1 +1,0 @@
-"""The network of stations and targets: model, solver, datum, outliers, covariance."""

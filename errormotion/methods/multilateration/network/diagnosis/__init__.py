@@ -1,1 +1,0 @@
-"""Undetermined freedoms, outliers, and notes on both."""
