@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from errormotion.instruments.simulators.faults import Fault, parse_fault, stray_bytes
-from errormotion.instruments.simulators.late import LateAnswer
+from errormotion.instruments.simulators.faults import Fault, LateAnswer, parse_fault, stray_bytes
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.loopback.serving import make_server

@@ -14,8 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
 
-from errormotion.instruments.simulators.thermometer.modbus import SimulatedModbus
-from errormotion.instruments.simulators.thermometer.register_values import to_registers
+from errormotion.instruments.simulators.thermometer.modbus import SimulatedModbus, to_registers
 from errormotion.instruments.transports import parse_address
 from errormotion.instruments.transports.modbus.serving import ModbusServer, checksum
 

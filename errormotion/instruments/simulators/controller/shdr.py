@@ -45,8 +45,7 @@ from errormotion.instruments.simulators.controller.mtconnect.machine import (
 )
 from errormotion.instruments.simulators.controller.mtconnect.styles import STYLES, series
 from errormotion.instruments.simulators.device import DEFAULT_MACHINE
-from errormotion.instruments.simulators.faults import parse_fault, stray_bytes
-from errormotion.instruments.simulators.late import LateAnswer
+from errormotion.instruments.simulators.faults import LateAnswer, parse_fault, stray_bytes
 from errormotion.instruments.simulators.virtual_world.world import world
 from errormotion.instruments.transports import Address
 from errormotion.instruments.transports.loopback.serving import TcpServer

@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from errormotion.instruments.simulators.controller.mtconnect.makers_styles import mazak, okuma
-from errormotion.instruments.simulators.controller.mtconnect.style_parts import AXES, data_item, data_items, inside
+from errormotion.instruments.simulators.controller.mtconnect.makers_styles import (
+    AXES,
+    data_item,
+    data_items,
+    inside,
+    mazak,
+    okuma,
+)
 
 
 @dataclass(frozen=True)

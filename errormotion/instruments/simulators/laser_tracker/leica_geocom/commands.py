@@ -13,8 +13,7 @@ import datetime
 import math
 from typing import TYPE_CHECKING
 
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import Byte, Value
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import Byte, Code, RefusedError, Value
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.measuring import Measuring
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import FIELD, Telescope
 

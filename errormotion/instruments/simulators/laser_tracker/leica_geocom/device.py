@@ -8,8 +8,8 @@ from typing import Any
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.device import SimulatedDevice
 from errormotion.instruments.simulators.laser_tracker.leica_geocom import grammar
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.commands import DECIMALS, MODELS, Commands
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import Code, RefusedError
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import Telescope
 from errormotion.instruments.transports import Address
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import Code, RefusedError
 from errormotion.instruments.simulators.laser_tracker.leica_geocom.telescope import Telescope, atmospheric_ppm
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from errormotion.instruments.simulators.laser_tracker.leica_geocom.codes import Code, RefusedError
+from errormotion.instruments.simulators.laser_tracker.leica_geocom.grammar import Code, RefusedError
 from errormotion.instruments.simulators.virtual_world.tracker_scene import TrackerScene
 from errormotion.instruments.transports import Address
 
