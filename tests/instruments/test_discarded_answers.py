@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from emscon_answers import encode_answer
 
 from errormotion.errors import InstrumentTimeoutError
 from errormotion.instruments.controller.linuxcnc.driver import LinuxCNC
@@ -93,7 +94,7 @@ def ask_emscon(line: Line) -> None:
         (ask_dcon, b">+025.00\r"),
         (ask_linuxcnc, json.dumps({"id": 1, "ok": True, "result": None}).encode() + b"\n"),
         (ask_ljx, ljx.reply(command=0x42)),
-        (ask_emscon, emscon.encode_answer(list(emscon.COMMANDS)[1])),
+        (ask_emscon, encode_answer(list(emscon.COMMANDS)[1])),
     ],
 )
 def test_a_discarded_answer_is_stated_where_the_awaited_one_is_missing(

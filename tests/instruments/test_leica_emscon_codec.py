@@ -4,6 +4,7 @@ import importlib
 import struct
 
 import pytest
+from emscon_answers import encode_answer, encode_result
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -39,7 +40,6 @@ def test_commands_are_those_of_the_published_interface(vector: Vector) -> None:
     values = dict(vector.expected)
     number = values.pop("number")
     assert codec.encode_command(number, **values) == vector.data
-    assert codec.decode_command(vector.data) == (number, values)
 
 
 @pytest.mark.parametrize("vector", vectors("leica_emscon", "answer"), ids=str)
@@ -104,7 +104,7 @@ SIZES = {
 
 def test_all_commands_have_the_sizes_of_the_c_structures() -> None:
     assert {
-        number: (len(codec.encode_command(number)), len(codec.encode_answer(number))) for number in codec.COMMANDS
+        number: (len(codec.encode_command(number)), len(encode_answer(number))) for number in codec.COMMANDS
     } == SIZES
 
 
@@ -115,20 +115,21 @@ def test_a_continuous_measurement_names_a_region_that_every_version_of_the_inter
 @given(command_and_values("request"))
 def test_a_command_round_trips(pair: tuple[int, dict[str, object]]) -> None:
     number, values = pair
-    assert codec.decode_command(codec.encode_command(number, **values)) == (number, values)
+    data = codec.encode_command(number, **values)
+    assert codec.COMMANDS[number].request.unpack(data, codec.HEADER.size + 4) == values
 
 
 @given(command_and_values("answer"))
 def test_an_answer_round_trips(pair: tuple[int, dict[str, object]]) -> None:
     number, values = pair
-    packet = decoded(codec.encode_answer(number, 0, **values))
+    packet = decoded(encode_answer(number, 0, **values))
     assert (packet.kind, packet.command, packet.status, packet.values) == (codec.COMMAND, number, 0, values)
 
 
 @given(st.sampled_from([codec.MULTI, codec.MULTI2]), st.data())
 def test_points_round_trip(kind: int, data: st.DataObject) -> None:
     points = data.draw(st.lists(values_of(codec.POINTS[kind]), max_size=5))
-    packet = decoded(codec.encode_result(kind, {"temperature": 21.5}, points=points))
+    packet = decoded(encode_result(kind, {"temperature": 21.5}, points=points))
     assert list(packet.points) == points
     assert (packet.values["count"], packet.values["temperature"]) == (len(points), 21.5)
 
@@ -141,24 +142,23 @@ def test_a_single_measurement_has_156_bytes_with_the_distance_after_two_angles()
     assert len(data) == 156
     assert [packet.values[f"val{k}"] for k in (1, 2, 3)] == [1.0, 2.0, 3.0]
     assert [packet.values[name] for name in ("temperature", "pressure", "humidity")] == [15.0, 16.0, 17.0]
-    assert codec.encode_result(codec.SINGLE, packet.values) == data
+    assert encode_result(codec.SINGLE, packet.values) == data
 
 
 @pytest.mark.parametrize(
     ("kind", "size"), [(codec.SINGLE2, 204), (codec.LEVEL, 40), (codec.REFLECTOR, 36), (codec.MULTI, 48)]
 )
 def test_results_have_the_sizes_of_the_c_structures(kind: int, size: int) -> None:
-    assert len(codec.encode_result(kind, {})) == size
+    assert len(encode_result(kind, {})) == size
 
 
 def test_a_refusal_has_no_values_after_its_status() -> None:
-    packet = decoded(codec.encode_answer(codec.GET_REFLECTORS, statuses.BUSY))
+    packet = decoded(encode_answer(codec.GET_REFLECTORS, statuses.BUSY))
     assert (packet.status, dict(packet.values)) == (statuses.BUSY, {})
 
 
 def test_an_unknown_command_is_reported_by_its_number() -> None:
-    assert codec.decode_command(struct.pack("<iII", 12, 0, 9999)) == (9999, {})
-    assert decoded(codec.encode_answer(9999, statuses.NOT_IMPLEMENTED)).command == 9999
+    assert decoded(encode_answer(9999, statuses.NOT_IMPLEMENTED)).command == 9999
 
 
 @pytest.mark.parametrize(
@@ -177,13 +177,13 @@ def test_invalid_headers_are_reported(header: bytes) -> None:
 
 
 def test_a_packet_that_ends_early_is_refused() -> None:
-    data = codec.encode_result(codec.SINGLE, {})
+    data = encode_result(codec.SINGLE, {})
     with pytest.raises(ProtocolError, match="too short"):
         codec.decode_packet(codec.SINGLE, data[8:100])
 
 
 def test_points_that_do_not_fill_their_packet_are_refused() -> None:
-    data = codec.encode_result(codec.MULTI, {}, points=[{}, {}])
+    data = encode_result(codec.MULTI, {}, points=[{}, {}])
     with pytest.raises(ProtocolError, match="2 points with 36 bytes"):
         codec.decode_packet(codec.MULTI, data[8:-1])
 
@@ -210,7 +210,7 @@ def test_commands_are_byte_for_byte_those_of_another_implementation(number: int)
             name: "Name" if code == codec.NAME else k if code != "d" else k + 0.5
             for k, (name, code) in enumerate(layout.fields, 1)
         }
-        ours = codec.encode_command(number, **values) if suffix == "CT" else codec.encode_answer(number, 0, **values)
+        ours = codec.encode_command(number, **values) if suffix == "CT" else encode_answer(number, 0, **values)
         assert ours[:head] == packed[:head]
         packet.unpack(ours)
         assert packet.pack() == ours

@@ -7,6 +7,7 @@ from functools import cache, partial
 from itertools import islice
 
 import wire_readers as readers
+from emscon_answers import encode_change, encode_result
 from fuzzing import Codec
 from wire_readers import folder
 from wire_vectors import vectors
@@ -141,14 +142,14 @@ READER_WORDS = readers.LAYOUT.words
 
 def emscon_packets() -> list[bytes]:
     own = [frame for frame in session("leica_emscon")[0] if len(frame) > emscon.HEADER.size]
-    return [*own, *rows("leica_emscon", "answer", "result", "points", "error"), emscon.encode_change(1)]
+    return [*own, *rows("leica_emscon", "answer", "result", "points", "error"), encode_change(1)]
 
 
 def emscon_points() -> list[bytes]:
     def packet(first: int) -> bytes:
         times = [divmod(10_000 * number, 1_000_000) for number in range(first, first + 5)]
         points = [{"seconds": s, "microseconds": us, "val3": 2.0} for s, us in times]
-        return emscon.encode_result(emscon.MULTI, {}, points=points)
+        return encode_result(emscon.MULTI, {}, points=points)
 
     return [b"".join(map(packet, (0, 5, 10, 15)))]
 
@@ -300,10 +301,6 @@ CODECS: Sequence[Codec] = (
     Codec("keyence_ljx", "requests", ljx.parse_request, lambda: rows("keyence_ljx", "request"), ljx.MAX_REPLY_BYTES),
     Codec("leica_emscon", "packets", readers.emscon_packets, emscon_packets, emscon.MAX_PACKET_BYTES),
     Codec("leica_emscon", "points", readers.emscon_points, emscon_points, emscon.MAX_PACKET_BYTES),
-    Codec(
-        *("leica_emscon", "commands", emscon.decode_command, lambda: rows("leica_emscon", "command")),
-        emscon.MAX_PACKET_BYTES,
-    ),
     Codec("leica_geocom", "replies", geocom_values, lambda: rows("leica_geocom", "reply"), geocom.MAX_REPLY),
     Codec("attocube_ids", "replies", ids_values, lambda: rows("attocube_ids", "reply"), ids.MAX_REPLY),
     Codec("tracker_table", "files", readers.tracker_table, tables, table_reader.MAX_TABLE, tried=4096, per_byte=128),

@@ -214,16 +214,6 @@ def parse_value(text: str, display: Display) -> tuple[float, int]:
     return float(text) * display.unit, 0
 
 
-def format_value(value: float, display: Display) -> str:
-    """Return a value (m) as the controller sends it; NaN as no value, a value with too many digits as out of range."""
-    if value != value:
-        return NO_VALUE
-    text = f"{value / display.unit:+z08.{display.decimals}f}"
-    if len(text) > WIDTH:
-        return OVER if value > 0 else UNDER
-    return text
-
-
 def check_rate(rate: float, baudrate: int, controller: Controller) -> None:
     """Refuse a rate (Hz) that exceeds the capacity of the line.
 

@@ -78,16 +78,6 @@ def encode_value(raw: int, *, first: bool = True) -> bytes:
     return bytes((raw & 0x3F, 0x40 | raw >> 6 & 0x3F, (0x80 if first else 0xC0) | raw >> 12))
 
 
-def decode_value(triple: bytes) -> int:
-    """Return the 18-bit value of three bytes; ProtocolError if their tags are wrong."""
-    if len(triple) != BYTES_PER_VALUE or not _VALUE.fullmatch(triple):
-        raise ProtocolError(
-            f"Expected three bytes tagged 00, 01, 1x; found {triple.hex(' ')}", code="protocol.value.form"
-        )
-    low, middle, high = triple
-    return low | (middle & 0x3F) << 6 | (high & 0x3F) << 12
-
-
 def text_of(data: bytes) -> bytes:
     """Return bytes without the values in them."""
     return _VALUE.sub(b"", data)
