@@ -165,7 +165,10 @@ def components(
             if change <= CHANGED or (change <= STALLED and change > before / 2):
                 break
         start = linear.at if found is not None else None
-        found = fit(_weighted(problem, contrasts.names, used), refresh=refresh, what=what, start=start)
+        weighted = _weighted(problem, contrasts.names, used)
+        found = fit(weighted, refresh=refresh, what=what, start=start, numbering=linear.numbering)
+        if problem.linear and refresh is None:
+            break  # the contrasts are the same at any solution
         linear = _unweighted(found.linear, problem, contrasts.names, used)
     else:
         raise FitError(

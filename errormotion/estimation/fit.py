@@ -142,6 +142,7 @@ def fit(
     refresh: Callable[[Problem, Any], Problem] | None = None,
     what: str = "the readings",
     start: Unknown | None = None,
+    numbering: Numbering | None = None,
 ) -> Fit:
     """Return the unknowns that minimise the weighted sum of squares.
 
@@ -155,13 +156,15 @@ def fit(
         What the readings are, for messages.
     start : Unknown, optional
         Where the iteration starts, such as the solution of a similar problem (``Fit.linear.at``).
+    numbering : Numbering, optional
+        Of a problem with the same index maps and estimated unknowns (``Fit.linear.numbering``).
 
     Raises
     ------
     FitError
         The readings do not determine the unknowns, which are named; or the iteration has not converged.
     """
-    number = Numbering.of(problem)
+    number = Numbering.of(problem) if numbering is None else numbering
     at = problem.start if start is None else start
     last = before = np.inf
     linear: Linear | None = None
