@@ -33,8 +33,9 @@ from errormotion.arrays import Array
 from errormotion.errors import FitError
 from errormotion.estimation.blocks import Block, Index, Noise
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.normal import SingularError, factorised
-from errormotion.estimation.problem import Linear, Problem, linearised
+from errormotion.estimation.linear.normal import SingularError, factorised
+from errormotion.estimation.linear.system import Linear, linearised
+from errormotion.estimation.problem import Problem
 
 __all__ = ["NOISE", "Components", "components", "noise_variance"]
 

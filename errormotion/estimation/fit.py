@@ -17,8 +17,10 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import FitError
-from errormotion.estimation.normal import Normal, SingularError
-from errormotion.estimation.problem import Linear, Numbering, Problem, Unknown, linearised, white_of
+from errormotion.estimation.linear.normal import Normal, SingularError
+from errormotion.estimation.linear.numbering import Numbering
+from errormotion.estimation.linear.system import Linear, linearised, white_of
+from errormotion.estimation.problem import Problem, Unknown
 
 __all__ = ["Fit", "fit"]
 

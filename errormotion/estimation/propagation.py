@@ -22,7 +22,7 @@ from errormotion.arrays import Array
 from errormotion.estimation.blocks import Constant, Index, Table
 from errormotion.estimation.derivatives import by_rows
 from errormotion.estimation.fit import Fit
-from errormotion.estimation.problem import by_slot
+from errormotion.estimation.linear.system import by_slot
 
 __all__ = ["Seen", "effects_of_constants"]
 

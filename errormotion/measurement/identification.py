@@ -23,7 +23,7 @@ from errormotion.estimation.datum import Relative, relative
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.fewest import fewest
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.normal import SingularError
+from errormotion.estimation.linear.normal import SingularError
 from errormotion.estimation.problem import Problem, Unknown
 from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import expansion

@@ -475,7 +475,7 @@ def test_a_linear_problem_has_its_derivatives_computed_once() -> None:
 
     def derivatives(_y: Array, rows: Any, _c: Any) -> Mapping[str, Array]:
         calls.append(1)
-        return {"line": -np.stack([np.ones(7), x], axis=1)[:, None, :]}
+        return {"line": -np.stack([np.ones(7), x], axis=1)[:, None, :], problems.READINGS: np.ones((7, 1, 1))}
 
     once = replace(plain, derivatives=derivatives, linear=True)
     far = fit(once, start=Unknown([np.full((1, 2), 1e3)], []))

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from errormotion.estimation import groups as grouping
-from errormotion.estimation.groups import Groups, Layout, labels
+from errormotion.estimation.linear import groups as grouping
+from errormotion.estimation.linear.groups import Groups, Layout, labels
 
 INDEX = st.integers(1, 60).flatmap(lambda n: arrays(np.intp, (n, 3), elements=st.integers(0, 3)))
 

@@ -373,3 +373,9 @@ def test_the_span_has_the_decimals_of_its_uncertainty():
     )
     assert by_name["EXC"][2:6] == ["−20.00", "+20.00", "0.61", "0.61"]
     assert by_name["ECC"][2:6] == ["—"] * 4
+
+
+@pytest.mark.parametrize("over", [(), ""])
+def test_a_table_without_rows_says_what_is_missing(over):
+    with pytest.raises(ValueError, match="table 'Sizes': expected the dims of its rows"):
+        Table("Sizes", (Column("noise"),), over)

@@ -26,7 +26,8 @@ from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Index, Noise, Table
 from errormotion.estimation.derivatives import by_rows, column
 from errormotion.estimation.fit import Fit, fit
-from errormotion.estimation.problem import Problem, Unknown, linearised
+from errormotion.estimation.linear.system import linearised
+from errormotion.estimation.problem import Problem, Unknown
 
 __all__ = ["Correlated", "autoregressive", "coloured", "correlated", "effective_number", "lag_one", "with_trend"]
 

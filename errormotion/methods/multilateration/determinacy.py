@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.errors import FitError, MethodError
 from errormotion.estimation.fit import Fit
-from errormotion.estimation.problem import Problem, linearised
+from errormotion.estimation.linear.system import linearised
+from errormotion.estimation.problem import Problem
 from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration.start import Stations
 

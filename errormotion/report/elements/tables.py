@@ -135,6 +135,13 @@ class Table:
     notes: Sequence[str | Callable[[xr.Dataset], Sequence[str]]] = ()
     absent: str = ""
 
+    def __post_init__(self) -> None:
+        if not self.over:
+            raise ValueError(
+                f"table '{self.caption}': expected the dims of its rows (over), at least one; found none. Without a "
+                "dim, state the values as figures or notes."
+            )
+
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
         """Return the table; a note or nothing without its variables."""
         ds = source.errors if self.of is None else self.of(source.errors)

@@ -13,7 +13,8 @@ from errormotion.estimation.additions import with_linear
 from errormotion.estimation.blocks import Block, Noise
 from errormotion.estimation.checks.candidates import Candidate, steps
 from errormotion.estimation.checks.effects import Numbers, information, solved
-from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, _Sequence, cleaned, doubts, notes
+from errormotion.estimation.checks.exclusions import FALSE_ALARM, Cleaned, cleaned, doubts, notes
+from errormotion.estimation.checks.suspects import Sequence
 from errormotion.estimation.fit import Fit, fit
 from errormotion.estimation.problem import Problem
 
@@ -262,7 +263,7 @@ def test_the_chances_of_several_numbers_are_those_of_each_given_the_others(whole
     y[[3, 7, 11, 20]] += 10.0
     problem = vectors(y, np.tile(np.eye(3) + 0.3, (30, 1, 1)))
     found = fit(replace(problem, noise=replace(problem.noise, stated=stated)))
-    sequence = _Sequence(found, Numbers(found, whole), 0.0, np.log(1e-5))
+    sequence = Sequence(found, Numbers(found, whole), 0.0, np.log(1e-5))
     chosen = [j for j, _ in sequence.order]
     assert len(chosen) > 3
     each = [sequence._given(j, [i for i in chosen if i != j]).chance for j in chosen]

@@ -15,7 +15,7 @@ from scipy.special import chdtri
 
 from errormotion.errors import MethodError
 from errormotion.estimation.fit import Fit
-from errormotion.estimation.problem import linearised
+from errormotion.estimation.linear.system import linearised
 from errormotion.methods.beam_direction.identification.direction import Direction, near
 
 FALSE_ALARM = 1e-3

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.estimation.normal import SingularError, factorised
+from errormotion.estimation.linear.normal import SingularError, factorised
 from errormotion.kinematics.twists import rigid_motions
 from errormotion.methods.multilateration import determinacy
 from errormotion.methods.multilateration.start import Stations
