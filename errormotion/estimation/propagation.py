@@ -174,10 +174,7 @@ def _on_border(fit: Fit, part: slice) -> Array:
     q, columns = fit.normal.S.shape[0], linear.numbering.columns[part]
     B = np.zeros((len(columns), q + 1, linear.border.shape[1]))
     seen = np.swapaxes(linear.border[part], 1, 2)
-    if linear.numbering.same_columns:
-        np.add.at(B, (slice(None), columns[0]), seen)
-    else:
-        np.add.at(B, (np.arange(len(columns))[:, None], columns), seen)
+    np.add.at(B, (np.arange(len(columns))[:, None], columns), seen)
     found = B[:, :q]
     if fit.normal.coupled:
         found = found - np.swapaxes(linear.local_matrix[part] @ fit.normal.F[part], 1, 2)

@@ -166,8 +166,8 @@ def errors_of(
     tables = {k: table for k, table in enumerate(maps) if table is not None}
     value = equation([table.rows(values[k]) for k, table in tables.items()])
     if not np.isfinite(value).any():
-        names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
-        without = ", ".join(names[k] for k in range(len(names)) if k not in tables)
+        tables_of = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
+        without = ", ".join(name for k, name in enumerate(tables_of) if k not in tables)
         raise FitError(
             f"all errors are NaN; places need the rows of the tables that they depend on (without: {without})",
             code="estimation.places.no_errors",

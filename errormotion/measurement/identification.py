@@ -302,17 +302,13 @@ def of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
     shape = tuple(raw.sizes[dim] for dim in dims)
     out = np.isfinite(numbers) & ~np.isfinite(column(white.problem.readings))
     residual = replace(white.problem, readings=given.readings).residuals(white.linear.at)
-    parts: dict[str, tuple[Array, dict[str, str]]] = {
+    parts: dict[str, tuple[Any, dict[str, str]]] = {
         "residual": (residual, {"units": unit, "long_name": "reading minus fitted, also of excluded readings"}),
-        "left_out": (out.any(axis=1) if single else out, {"long_name": "1 = excluded"}),
+        "left_out": ((out.any(axis=1) if single else out).astype(np.int8), {"long_name": "1 = excluded"}),
+        **reliability_of(solved, unit),
     }
-    found = {
+    return {
         name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs) for name, (values, attrs) in parts.items()
-    }
-    found["left_out"] = found["left_out"].astype(np.int8)
-    return found | {
-        name: xr.DataArray(values.reshape(shape), dims=dims, attrs=attrs)
-        for name, (values, attrs) in reliability_of(solved, unit).items()
     }
 
 
