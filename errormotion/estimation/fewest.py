@@ -40,6 +40,7 @@ def fewest(found: Relative) -> Relative:
     u = np.sqrt(np.where(variance == 0, np.inf, variance))  # NaN where unknown
     u_h = np.sqrt(np.diagonal(found.covariance))
     u_h = np.where(u_h > 0, u_h, np.inf)
+    least, rounding = NEGLIGIBLE * u, ROUNDING * u
     kept, influence = list[Source](), list[Array]()
     for name in dict.fromkeys(source.joined or str(k) for k, source in enumerate(sources)):
         at = [k for k, source in enumerate(sources) if (source.joined or str(k)) == name]
@@ -47,8 +48,10 @@ def fewest(found: Relative) -> Relative:
         if its[0].joined and (joined := _joined(its, effects, u, u_h)) is not None:
             its, effects = joined
         for source, effect in zip(its, effects, strict=True):
-            if (np.abs(source.effect) > NEGLIGIBLE * u).any() or (np.abs(effect) > NEGLIGIBLE * u_h).any():
-                kept.append(replace(source, effect=_without_rounding(source.effect, u)))
+            size = np.abs(source.effect)
+            if (size > least).any() or (np.abs(effect) > NEGLIGIBLE * u_h).any():
+                small = size <= rounding  # False for NaN
+                kept.append(replace(source, effect=np.where(small, 0.0, source.effect)) if small.any() else source)
                 influence.append(effect)
     errors = replace(found.errors, sources=kept)
     return replace(found, errors=errors, influence=np.reshape(influence, (len(kept), of_h.shape[1])))
@@ -72,9 +75,3 @@ def _joined(sources: list[Source], of_h: Array, u: Array, u_h: Array) -> tuple[l
         effect = np.where(unknown, np.nan, row[: u.size].reshape(u.shape) * unit)
         joined.append(replace(sources[0], name=sources[0].joined + (f" {k + 1}" if k else ""), effect=effect))
     return joined, scaled[:, u.size :] * np.where(np.isfinite(u_h), u_h, 0.0)
-
-
-def _without_rounding(effect: Array, u: Array) -> Array:
-    """Return an effect that is exactly 0 where it is rounding of the standard uncertainties u."""
-    small = np.abs(effect) <= ROUNDING * u  # False for NaN
-    return np.where(small, 0.0, effect) if small.any() else effect
