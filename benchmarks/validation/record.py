@@ -8,13 +8,14 @@ import numpy as np
 
 from errormotion.record.control import chart
 from errormotion.record.series import YEAR, Series
-from errormotion.record.steps import model_of
+from errormotion.record.steps import Model, model_of
 
 TITLE = "History of a figure"
 SEEDS = 500
 SLOPE, BAR, U = 2e-6, 1e-6, (0.5e-6, 1.5e-6)
 """Trend, m per year; standard uncertainty of a bar that all runs share, and range of the rest, m."""
 COUNTS, TAUS, SIZE = (12, 24, 60), (0.0, 1e-6, 3e-6), 4.0
+DAYS = (60, 180)
 
 
 def section(seeds: int) -> Iterator[str]:
@@ -37,14 +38,41 @@ def section(seeds: int) -> Iterator[str]:
     for count in COUNTS:
         for tau in TAUS:
             yield row(count, tau, seeds)
+    yield from (
+        "",
+        "The same without a step, where the variation of the machine is alike in neighbouring runs: its correlation is "
+        "exp(-d / T) over the time d. `alike`: share of histories that state it.",
+        "",
+        "| runs | reproducibility | T | alike | false steps | false departures | trend |",
+        "|---|---|---|---|---|---|---|",
+    )
+    for count in COUNTS[:2]:
+        for tau in TAUS[1:]:
+            for days in DAYS:
+                rng = np.random.default_rng(count)
+                found = [model_of(made(rng, count, tau, SLOPE, days)) for _ in range(seeds)]
+                alike = np.mean([each.fit is not None and each.fit.duration > 0 for each in found])
+                steps, single, trend = rates_of(found)
+                yield (
+                    f"| {count} | {tau * 1e6:g} um | {days} days | {alike:.1%} | {steps:.1%} | {single:.1%} | "
+                    f"{trend:.1%} |"
+                )
+
+
+def rates_of(found: list[Model]) -> tuple[float, float, float]:
+    """Return the shares of models with steps, with departures, and with the true trend in its interval."""
+    trend = np.mean([each.trend[1] <= SLOPE <= each.trend[2] for each in found])
+    return (
+        float(np.mean([bool(m.steps) for m in found])),
+        float(np.mean([bool(m.departing) for m in found])),
+        float(trend),
+    )
 
 
 def row(count: int, tau: float, seeds: int) -> str:
     """Return one row of the table."""
     rng = np.random.default_rng(count)
-    found = [model_of(made(rng, count, tau, SLOPE)) for _ in range(seeds)]
-    steps, single = (np.mean([bool(part) for part in parts]) for parts in zip(*map(parts_of, found), strict=True))
-    trend = np.mean([each.trend[1] <= SLOPE <= each.trend[2] for each in found])
+    steps, single, trend = rates_of([model_of(made(rng, count, tau, SLOPE)) for _ in range(seeds)])
     outside = 0.0
     for _ in range(seeds):
         values = made(rng, count, tau, 0.0)
@@ -66,12 +94,12 @@ def row(count: int, tau: float, seeds: int) -> str:
     return f"| {count} | {tau * 1e6:g} um | {rates} | {known} |"
 
 
-def parts_of(model):
-    return model.steps, model.departing
-
-
-def made(rng: np.random.Generator, count: int, tau: float, slope: float) -> Series:
+def made(rng: np.random.Generator, count: int, tau: float, slope: float, days: float = 0.0) -> Series:
     """Return a history drawn from its own covariance."""
     t, u = np.sort(rng.uniform(0, 3 * YEAR, count)), rng.uniform(*U, count)
-    y = 5e-6 + slope * t / YEAR + u * rng.normal(size=count) + tau * rng.normal(size=count) + BAR * rng.normal()
+    between = rng.normal(size=count)
+    if days:
+        R = np.exp(-np.abs(np.subtract.outer(t, t)) / (86400 * days)) + 1e-9 * np.eye(count)
+        between = np.linalg.cholesky(R) @ between
+    y = 5e-6 + slope * t / YEAR + u * rng.normal(size=count) + tau * between + BAR * rng.normal()
     return Series(t, y, np.sqrt(u**2 + BAR**2), np.full((1, count), BAR), ["bar"])

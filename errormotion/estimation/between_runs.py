@@ -11,6 +11,12 @@ from run to run, independent with the standard deviation tau, the reproducibilit
 * DerSimonian and Laird (Control. Clin. Trials 7 (1986) 177): the first one without iteration, for many means at once.
 
 All are 0 if the stated uncertainties alone explain the scatter.
+
+m may be alike in neighbouring runs, since machines age and sites have seasons: its correlation over the time d is then
+``exp(-d / T)``. T is one of some multiples of the mean interval, or 0 for independent runs, with the restricted
+likelihood of each, in which the scale of the covariance is eliminated, times the prior of `correlated.TYPICAL` for the
+correlation of neighbours. Parameters are means over T with these weights, so that their covariance contains what T is
+unknown by.
 """
 
 from __future__ import annotations
@@ -23,9 +29,16 @@ from scipy.optimize import brentq
 from scipy.special import chdtr, stdtrit
 
 from errormotion.arrays import Array, filled
+from errormotion.estimation.checks.correlated import TYPICAL
 
 COVERAGE = 0.95
 """Coverage probability of the intervals of trend and steps."""
+FEWEST = 8
+"""Runs without which they are taken as independent: they could not show a correlation."""
+_MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
+"""Times over which runs may be alike, in mean intervals."""
+_OWN = 1e-6
+"""Share of the variance that runs at the same time do not have in common."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,8 @@ class RunFit:
         Chi-square of the residuals for the stated uncertainties only (tau = 0), and probability of a smaller value.
     degrees : int
     fitted, fitted_half_width : ndarray, (n,)
+    duration : float
+        Most likely T, in the unit of the times; 0 for independent runs.
     """
 
     parameters: Array
@@ -54,9 +69,10 @@ class RunFit:
     degrees: int
     fitted: Array
     fitted_half_width: Array
+    duration: float = 0.0
 
 
-def fit_runs(X: Array, y: Array, V0: Array) -> RunFit | None:
+def fit_runs(X: Array, y: Array, V0: Array, time: Array | None = None) -> RunFit | None:
     """Return the fit of ``y = X b``; None without degrees of freedom, or for dependent columns.
 
     Parameters
@@ -66,6 +82,8 @@ def fit_runs(X: Array, y: Array, V0: Array) -> RunFit | None:
         Values, in any unit, which is also that of tau.
     V0 : ndarray, (n, n)
         Stated covariance of the values.
+    time : ndarray, (n,), optional
+        Of the runs, not decreasing; by default the runs are independent.
 
     Notes
     -----
@@ -74,18 +92,61 @@ def fit_runs(X: Array, y: Array, V0: Array) -> RunFit | None:
     n, p = X.shape
     if n <= p or np.linalg.matrix_rank(X) < p:
         return None
-    chi2 = float(_residual_square(X, y, V0, 0.0))
-    tau = _paule_mandel(X, y, V0)
-    V = V0 + tau**2 * np.eye(n)
-    factor = cho_factor(V)
-    C = np.asarray(np.linalg.inv(X.T @ cho_solve(factor, X)), dtype=float)
-    b: Array = C @ (X.T @ cho_solve(factor, y))
+    one = np.eye(n)
+    chi2 = float(_residual_square(X, y, V0, 0.0, one))
+    durations = alike(time, n)
+    fits, logs = [], []
+    for T, prior in durations:
+        R = correlation(time, n, T)
+        tau = paule_mandel(X, y, V0, R)
+        V = V0 + tau**2 * R
+        factor = cho_factor(V)
+        C = np.asarray(np.linalg.inv(X.T @ cho_solve(factor, X)), dtype=float)
+        b: Array = C @ (X.T @ cho_solve(factor, y))
+        rest = y - X @ b
+        logs.append(
+            -np.log(np.diag(factor[0])).sum()
+            + 0.5 * np.linalg.slogdet(C)[1]
+            - 0.5 * (n - p) * np.log(max(float(rest @ cho_solve(factor, rest)), 1e-300))
+            + prior
+        )
+        fits.append((b, C, tau))
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    best = int(np.argmax(weight))
+    mean: Array = sum(w * b for w, (b, _, _) in zip(weight, fits, strict=True))  # type: ignore[assignment]
+    whole: Array = sum(  # type: ignore[assignment]
+        w * (C + np.outer(b - mean, b - mean)) for w, (b, C, _) in zip(weight, fits, strict=True)
+    )
     quantile = float(stdtrit(n - p, 0.5 + COVERAGE / 2))
-    spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, C, X))
+    spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, whole, X))
     below = float(chdtr(n - p, chi2))
-    half_width: Array = quantile * np.sqrt(np.diag(C))
-    fitted: Array = X @ b
-    return RunFit(b, half_width, C, tau, chi2, below, n - p, fitted, quantile * spread)
+    half_width: Array = quantile * np.sqrt(np.diag(whole))
+    fitted: Array = X @ mean
+    tau = fits[best][2]
+    return RunFit(
+        mean, half_width, whole, tau, chi2, below, n - p, fitted, quantile * spread, durations[best][0] if tau else 0.0
+    )
+
+
+def alike(time: Array | None, n: int) -> list[tuple[float, float]]:
+    """Return the times T over which n runs may be alike, with their log priors; T = 0 alone for few runs."""
+    found = [(0.0, 0.0)]
+    extent = 0.0 if time is None else float(np.ptp(time))
+    if n < FEWEST or not extent > 0:
+        return found
+    interval = extent / (n - 1)
+    for multiple in _MULTIPLES:
+        if multiple * interval <= extent:
+            found.append((multiple * interval, -0.5 * float(np.arctanh(np.exp(-1 / multiple)) / TYPICAL) ** 2))
+    return found
+
+
+def correlation(time: Array | None, n: int, T: float) -> Array:
+    """Return the correlation of n runs that are alike over the time T, (n, n)."""
+    if time is None or not T > 0:
+        return np.eye(n)
+    return np.asarray((1.0 - _OWN) * np.exp(-np.abs(np.subtract.outer(time, time)) / T) + _OWN * np.eye(n))
 
 
 def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> float:
@@ -148,22 +209,28 @@ def variance_between(value: Array, variance: Array) -> tuple[Array, Array, Array
     return np.where(total > 0, mean, np.nan), np.where(total > 0, u, np.nan), np.sqrt(tau2)
 
 
-def _paule_mandel(X: Array, y: Array, V0: Array) -> float:
-    """Return tau; the sum of squares decreases with tau, so that there is at most one root."""
+def paule_mandel(X: Array, y: Array, V0: Array, R: Array) -> float:
+    """Return tau of a variation with the correlation R (n, n) between runs.
+
+    The sum of squares decreases with tau, so that there is at most one root.
+    """
     degrees = int(X.shape[0] - X.shape[1])
 
     def excess(tau: float) -> float:
-        return float(_residual_square(X, y, V0, tau)) - degrees
+        return float(_residual_square(X, y, V0, tau, R)) - degrees
 
     if excess(0.0) <= 0:
         return 0.0
-    rest = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
-    high = float(np.sqrt(rest @ rest / degrees))  # with tau only, the sum is at most n - p at this value
+    # with tau only, the sum of squares about the line is n - p at this value
+    factor = np.linalg.cholesky(R)
+    WX, Wy = np.linalg.solve(factor, X), np.linalg.solve(factor, y)
+    rest = Wy - WX @ np.linalg.lstsq(WX, Wy, rcond=None)[0]
+    high = float(np.sqrt(rest @ rest / degrees))
     return float(brentq(excess, 0.0, high, xtol=1e-6 * high)) if excess(high) < 0 else high
 
 
-def _residual_square(X: Array, y: Array, V0: Array, tau: float) -> float:
-    factor = cho_factor(V0 + tau**2 * np.eye(y.size))
+def _residual_square(X: Array, y: Array, V0: Array, tau: float, R: Array) -> float:
+    factor = cho_factor(V0 + tau**2 * R)
     WX, Wy = cho_solve(factor, X), cho_solve(factor, y)
     b = np.linalg.solve(X.T @ WX, X.T @ Wy)
     return float((y - X @ b) @ (Wy - WX @ b))

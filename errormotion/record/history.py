@@ -60,12 +60,17 @@ TABLE: dict[str, tuple[tuple[str, ...], str, str]] = {
     "trend_high": ((), "figure", "upper end of its interval"),
     "reproducibility": ((), "figure", "tau by Paule and Mandel: standard deviation between runs about trend and steps"),
     "reproducibility_of_ranges": ((), "figure", "tau from the moving ranges, which the control limits hold"),
+    "duration": (
+        (),
+        "s",
+        "time over which runs are alike, 0 for independent ones; not in histories of earlier versions",
+    ),
     "chi2": ((), "number", "of the residuals for the stated uncertainties alone"),
     "chi2_p": ((), "p", "probability of a smaller one"),
     "degrees": ((), "number", "its degrees of freedom"),
 }
 UNITS = ("m", "rad", "1", "degC")
-OPTIONAL = ("version",)
+OPTIONAL = ("version", "duration")
 """Variables that histories of earlier versions do not contain."""
 
 
@@ -129,6 +134,7 @@ def history(runs: Listing, machine: str, figure: str, at: Sequence[float] | None
         "trend_high": model.trend[2],
         "reproducibility": fit.tau if fit else np.nan,
         "reproducibility_of_ranges": limits.tau if series.size > 1 else np.nan,
+        "duration": fit.duration if fit else np.nan,
         "chi2": fit.chi2 if fit else np.nan,
         "chi2_p": fit.p if fit else np.nan,
         "degrees": float(fit.degrees) if fit else np.nan,

@@ -1,12 +1,17 @@
 """Detection of steps and outliers in a series with a trend, with a stated rate of false alarms.
 
 Candidates are a step between any two neighbouring times with ``MIN_SIDE`` values on either side, and an outlier at any
-single run. The statistic of a candidate is its contribution g to the weighted sum of squares, in the metric of the
-covariance and orthogonal to the present model, divided by the scale: ``g (1 / r + 1 / s) / 2``. Here s is the mean
-square of the residuals, and r the mean square that follows from the moving ranges, without those that the candidate
-itself changes; undetected steps increase s, but hardly r. The largest statistic of each kind is compared with its
-distribution without steps and outliers, from simulated normal series with the same times and the same covariance: the
-probability of any false alarm is ``FALSE_STEPS + FALSE_DEPARTURES``. A significant candidate is added to the model, the
+single run. Runs may be alike over a time T (`errormotion.estimation.between_runs`), and a slow variation looks like a
+step: T is estimated with and without the candidate. With its contribution g to the weighted sum of squares r in the
+metric of the covariance V of each T, orthogonal to the present model, the statistic is
+
+    max over T, candidates of (log L(T, r - g)) - max over T of (log L(T, r)),    log L = -log|V| / 2 - n log(r) / 2,
+
+with the prior of T. g counts relative to the mean of two scales, which for T = 0 are the residuals and the moving
+ranges without those that the candidate itself changes: undetected steps increase the residuals, but hardly the ranges.
+The largest statistic of each kind is compared with its distribution without steps and outliers, from simulated normal
+series with the same times and the covariance of each T, as often as it is likely: the probability of any false alarm is
+``FALSE_STEPS + FALSE_DEPARTURES``. A significant candidate is added to the model, the
 positions of the earlier ones are optimised again, and the search is repeated with the distribution for the new model
 until no candidate is significant.
 
@@ -25,7 +30,15 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from errormotion.arrays import Array
-from errormotion.estimation.between_runs import RunFit, by_moving_ranges, difference_variance, fit_runs
+from errormotion.estimation.between_runs import (
+    RunFit,
+    alike,
+    by_moving_ranges,
+    correlation,
+    difference_variance,
+    fit_runs,
+    paule_mandel,
+)
 from errormotion.record.series import Series
 
 FALSE_STEPS = 0.035
@@ -101,10 +114,10 @@ def model_of(series: Series) -> Model:
         return Model(None)
     found = _search(series, base)
     X = _design(base, found)
-    result = fit_runs(X, series.value, series.covariance)
+    result = fit_runs(X, series.value, series.covariance, series.time)
     if result is None:
         return Model(None)
-    V = series.covariance + result.tau**2 * np.eye(series.size)
+    V = series.covariance + result.tau**2 * correlation(series.time, series.size, result.duration)
     steps, departing = list[Step](), list[int]()
     for number, each in enumerate(found):
         if each.single:
@@ -122,7 +135,9 @@ def _trend(series: Series, base: Array, found: list[Candidate], result: RunFit) 
     """Return the trend with its interval, which covers that of the model without uncertain candidates."""
     fits = [result]
     certain = [each for each in found if each.p <= CERTAIN]
-    if len(certain) < len(found) and (without := fit_runs(_design(base, certain), series.value, series.covariance)):
+    if len(certain) < len(found) and (
+        without := fit_runs(_design(base, certain), series.value, series.covariance, series.time)
+    ):
         fits.append(without)
     low = min(float(each.parameters[1] - each.half_width[1]) for each in fits)
     high = max(float(each.parameters[1] + each.half_width[1]) for each in fits)
@@ -189,64 +204,123 @@ def _repositioned(series: Series, base: Array, found: list[Candidate]) -> list[C
 
 
 class _Trial:
-    """Candidates for a model: their directions in whitened coordinates, and their statistics."""
+    """Candidates for a model in the metrics of several covariances, and their statistics.
+
+    ``V``, if it is given, is the covariance; otherwise it is one for each time over which runs may be alike.
+    """
 
     def __init__(self, series: Series, X: Array, candidates: list[Candidate], V: Array | None = None) -> None:
-        y, V0 = series.value, series.covariance
+        y, V0, n = series.value, series.covariance, series.size
+        columns = np.column_stack([c.column(n) for c in candidates])
+        metrics = [] if V is None else [(V, 0.0)]
         if V is None:
             residual = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
-            V = V0 + by_moving_ranges(residual, V0) ** 2 * np.eye(series.size)
-        self._L = np.linalg.cholesky(V)
-        self._Q, _ = np.linalg.qr(solve_triangular(self._L, X, lower=True))
-        Z = solve_triangular(self._L, np.column_stack([c.column(series.size) for c in candidates]), lower=True)
-        size = (Z**2).sum(axis=0)
-        Z = Z - self._Q @ (self._Q.T @ Z)
-        rest = (Z**2).sum(axis=0)
-        kept = rest > MIN_ORTHOGONAL * size
+            for T, prior in alike(series.time, n):
+                R = correlation(series.time, n, T)
+                # ranges hardly show what is alike in neighbours
+                tau = paule_mandel(X, y, V0, R) if T else by_moving_ranges(residual, V0)
+                if tau > 0 or not T:  # without a variation between runs there is nothing that is alike
+                    metrics.append((V0 + tau**2 * R, prior))
+        self._metrics = [_Metric(X, columns, each, prior) for each, prior in metrics]
+        kept = np.all([metric.orthogonal for metric in self._metrics], axis=0)
         self.candidates = [c for c, keep in zip(candidates, kept, strict=True) if keep]
-        self._G = Z[:, kept] / np.sqrt(rest[kept])
-        self._v = difference_variance(V)
+        for metric in self._metrics:
+            metric.keep(kept)
         self._index = np.array([c.index for c in self.candidates], dtype=int)
         self._single = np.array([c.single for c in self.candidates])
-        self._white = solve_triangular(self._L, y, lower=True)
+        self._y = y
 
     def squares(self) -> Array:
-        """Return twice the increase of the log likelihood by each candidate, (candidates,)."""
-        found: Array = (self._white @ self._G) ** 2
-        return found
+        """Return twice the increase of the log likelihood by each candidate in the first metric, (candidates,)."""
+        return self._metrics[0].squares(self._y)
 
     def best(self) -> Candidate:
-        """Return the candidate with the largest increase."""
-        return self.candidates[int(np.argmax(self.squares()))]
+        """Return the candidate with the largest likelihood."""
+        return self.candidates[int(np.argmax(self._statistics(self._y[None])[0]))]
 
     def significant(self, noise: Array) -> Candidate | None:
-        """Return the significant candidate with the largest increase, or None."""
-        gain, own, null = self.squares(), self._statistics(self._white[None])[0], self._statistics(noise)
-        best, largest = None, 0.0
+        """Return the significant candidate with the largest likelihood, or None."""
+        own, null = self._statistics(self._y[None])[0], self._statistics(self._simulated(noise))
+        best, largest = None, -np.inf
         for single, rate in ((False, FALSE_STEPS), (True, FALSE_DEPARTURES)):
-            kind = np.flatnonzero([each.single == single for each in self.candidates])
+            kind = np.flatnonzero(self._single == single)
             if not kind.size:
                 continue
             p = float((1 + np.sum(null[:, kind].max(axis=1) >= own[kind].max())) / (1 + len(null)))
             first = kind[np.argmax(own[kind])]
-            if p <= rate and gain[first] > largest:
-                best, largest = replace(self.candidates[first], p=p), float(gain[first])
+            if p <= rate and own[first] > largest:
+                best, largest = replace(self.candidates[first], p=p), float(own[first])
         return best
 
-    def _statistics(self, white: Array) -> Array:
-        """Return the statistics of the candidates for each row of whitened values (m, n)."""
-        rest = white - (white @ self._Q) @ self._Q.T
-        d = np.abs(np.diff(rest @ self._L.T, axis=1)) / np.sqrt(np.maximum(self._v, TINY))
+    def _simulated(self, noise: Array) -> Array:
+        """Return series without candidates from white noise (m, n), with each metric as often as it is likely."""
+        logs = np.array([float(metric.log_likelihood(self._y[None])[0]) for metric in self._metrics])
+        share = np.cumsum(np.exp(logs - logs.max()))
+        which = np.searchsorted(share / share[-1], (np.arange(len(noise)) + 0.5) / len(noise))
+        return np.concatenate([noise[which == k] @ metric.L.T for k, metric in enumerate(self._metrics)])
+
+    def _statistics(self, values: Array) -> Array:
+        """Return the statistics of the candidates for each row of values (m, n)."""
+        with_them = np.full((len(values), len(self.candidates)), -np.inf)
+        without = np.full(len(values), -np.inf)
+        for metric in self._metrics:
+            log = metric.log_likelihood(values)
+            without = np.maximum(without, log)
+            with_them = np.maximum(with_them, log[:, None] + metric.gains(values, self._index, self._single))
+        return with_them - without[:, None]
+
+
+class _Metric:
+    """A covariance V of the values, and the directions of candidates in whitened coordinates."""
+
+    def __init__(self, X: Array, columns: Array, V: Array, prior: float) -> None:
+        self.L: Array = np.linalg.cholesky(V)
+        self._inverse = solve_triangular(self.L, np.eye(len(V)), lower=True)
+        self._Q, _ = np.linalg.qr(self._inverse @ X)
+        Z = self._inverse @ columns
+        size = (Z**2).sum(axis=0)
+        Z = Z - self._Q @ (self._Q.T @ Z)
+        rest = (Z**2).sum(axis=0)
+        self.orthogonal = rest > MIN_ORTHOGONAL * size
+        self._G = Z / np.sqrt(np.where(self.orthogonal, rest, 1.0))
+        self._v = difference_variance(V)
+        self._constant = prior - float(np.log(np.diag(self.L)).sum())
+
+    def keep(self, kept: Array) -> None:
+        """Keep some of the candidates."""
+        self._G = self._G[:, kept]
+
+    def squares(self, y: Array) -> Array:
+        """Return the contributions of the candidates to the sum of squares of values (n,)."""
+        found: Array = (self._inverse @ y @ self._G) ** 2
+        return found
+
+    def _rest(self, values: Array) -> tuple[Array, Array]:
+        """Return whitened values (m, n), and their residuals."""
+        white = values @ self._inverse.T
+        return white, white - (white @ self._Q) @ self._Q.T
+
+    def log_likelihood(self, values: Array) -> Array:
+        """Return the log likelihood of each row of values (m, n) without a candidate, the scale being eliminated."""
+        square = (self._rest(values)[1] ** 2).sum(axis=1)
+        found: Array = self._constant - 0.5 * values.shape[1] * np.log(np.maximum(square, TINY))
+        return found
+
+    def gains(self, values: Array, index: Array, single: Array) -> Array:
+        """Return the increase of the log likelihood of each row (m, n) by each candidate."""
+        white, rest = self._rest(values)
+        d = np.abs(np.diff(rest @ self.L.T, axis=1)) / np.sqrt(np.maximum(self._v, TINY))
         # Ranges that a candidate changes: the one before its value, and of an outlier also the one after it.
         around = np.pad(d, ((0, 0), (1, 1)))
-        own = around[:, self._index] + np.where(self._single, around[:, self._index + 1], 0.0)
-        ends = (self._index == 0) | (self._index == d.shape[1])
-        count = d.shape[1] - 1 - (self._single & ~ends)
+        own = around[:, index] + np.where(single, around[:, index + 1], 0.0)
+        ends = (index == 0) | (index == d.shape[1])
+        count = d.shape[1] - 1 - (single & ~ends)
         scale = (d.sum(axis=1, keepdims=True) - own) / count
         gain = (white @ self._G) ** 2
-        square = ((rest**2).sum(axis=1, keepdims=True) - gain) / (white.shape[1] - self._Q.shape[1] - 1)
-        ranges = np.pi / 4 * scale**2
-        found: Array = 0.5 * gain * (1 / np.maximum(ranges, 1e-12) + 1 / np.maximum(square, 1e-12))
+        freedom = white.shape[1] - self._Q.shape[1] - 1
+        square = ((rest**2).sum(axis=1, keepdims=True) - gain) / freedom
+        ratio = 0.5 * gain * (1 / np.maximum(np.pi / 4 * scale**2, 1e-12) + 1 / np.maximum(square, 1e-12))
+        found: Array = 0.5 * values.shape[1] * np.log1p(ratio / freedom)
         return found
 
 

@@ -91,6 +91,11 @@ def sentences(ds: xr.Dataset) -> list[str]:
             + f", in addition to the stated standard uncertainty of the runs, {own_text:.2g} {unit}".rstrip()
             + " (median)."
         )
+    if "duration" in ds.variables and float(ds["duration"]) > 0:
+        found.append(
+            f"Neighbouring runs are alike over about {float(ds['duration']) / 86400:.2g} days: the intervals of trend "
+            "and steps contain it."
+        )
     if count := ds.sizes["source"]:
         found.append(f"Sources that several runs share, treated as fully correlated: {count}.")
     return found

@@ -31,6 +31,15 @@ def series(
     return Series(t, y, np.sqrt(u**2 + shared**2), F, ["bar"] if shared else [])
 
 
+def alike(rng: np.random.Generator, count: int, tau: float, days: float, size: float = 0.0) -> Series:
+    """Return three years of values whose deviations from the trend are alike for some days; a step in the middle."""
+    values = series(rng, count, 0.0)
+    R = np.exp(-np.abs(np.subtract.outer(values.time, values.time)) / (86400 * days)) + 1e-9 * np.eye(count)
+    y = values.value + tau * np.linalg.cholesky(R) @ rng.normal(size=count)
+    y += size * np.sqrt(np.mean(values.u**2) + tau**2) * (np.arange(count) >= count // 2)
+    return Series(values.time, y, values.u)
+
+
 def bound(rate: float, count: int) -> float:
     """Return three standard deviations of a counted rate."""
     return 3 * float(np.sqrt(rate * (1 - rate) / count))
@@ -60,6 +69,23 @@ def test_a_step_of_four_standard_deviations_is_found_where_it_is_with_its_size()
     assert hits >= (0.9 - bound(0.9, count)) * count
     assert within >= (0.95 - bound(0.95, hits)) * hits
     assert covered >= (0.9 - bound(0.9, hits)) * hits
+
+
+@pytest.mark.parametrize(("count", "days"), [(24, 60.0), (24, 180.0), (40, 60.0)])
+def test_runs_that_are_alike_make_no_steps_and_no_trend(count: int, days: float) -> None:
+    rng, tries = np.random.default_rng(6), 40
+    found = [model_of(alike(rng, count, 3e-6, days)) for _ in range(tries)]
+    # with independent runs: steps in half of them and more, trends covered in two thirds and fewer
+    assert np.mean([bool(each.steps) for each in found]) <= 0.05 + bound(0.05, tries)
+    covered = np.mean([each.trend[1] <= SLOPE <= each.trend[2] for each in found])
+    assert covered >= 0.9 - bound(0.9, tries)
+    assert np.median([0.0 if each.fit is None else each.fit.duration for each in found]) > 0
+
+
+def test_a_step_of_six_standard_deviations_is_found_among_runs_that_are_alike() -> None:
+    rng, tries = np.random.default_rng(7), 20
+    found = [model_of(alike(rng, 36, 1e-6, 30.0, size=6.0)) for _ in range(tries)]
+    assert np.mean([any(abs(step.index - 18) <= 1 for step in each.steps) for each in found]) >= 0.8
 
 
 def test_several_steps_are_detected_and_a_single_departure_is_not() -> None:
