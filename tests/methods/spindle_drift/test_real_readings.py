@@ -95,5 +95,5 @@ def test_run_out_that_sampling_makes_slow_is_doubted(speed: float, hidden: bool)
 def test_run_out_of_parts_of_turns_is_in_the_uncertainty() -> None:
     raw, truth = sampled(180.0, 200.0)  # one and a half turns in a mean
     share, errors = held(raw, truth)
-    assert any("a mean over 0.5 s contains 21% of the run-out" in each for each in errors.em.notes)
+    assert any("a mean over 0.5 s contains 21 % of the run-out" in each for each in errors.em.notes)
     assert share > 0.9

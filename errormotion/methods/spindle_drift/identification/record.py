@@ -398,13 +398,13 @@ def run_out_left(record: Record, stated: float, settings: Settings, notes: list[
             if each.frequency * settings.average < 1.0:
                 period = f"a wave with a period of about {1 / each.frequency:.2g} s" if each.frequency else "an offset"
                 doubts.append(
-                    f"{what} {each.share:.0%} of {order} as {period}, which the uncertainty does not contain. "
+                    f"{what} {100 * each.share:.0f} % of {order} as {period}, which the uncertainty does not contain. "
                     "Choose another spindle speed, sample rate or average."
                 )
             elif record.scatter is not None:
                 size = each.share * np.sqrt(np.maximum(record.scatter**2 - stated**2, 0.0))
                 if (size > stated / np.sqrt(count)).any():
-                    notes.append(f"{what} {each.share:.0%} of {order}; the uncertainty contains it.")
+                    notes.append(f"{what} {100 * each.share:.0f} % of {order}; the uncertainty contains it.")
                     found = np.maximum(found, size)
     return found
 
