@@ -73,10 +73,10 @@ def row(count: int, tau: float, seeds: int) -> str:
     """Return one row of the table."""
     rng = np.random.default_rng(count)
     steps, single, trend = rates_of([model_of(made(rng, count, tau, SLOPE)) for _ in range(seeds)])
-    outside = 0.0
+    outside: float = 0.0
     for _ in range(seeds):
         values = made(rng, count, tau, 0.0)
-        outside += np.mean(chart(values, model_of(values)).outside(values.value)) / seeds
+        outside += float(np.mean(chart(values, model_of(values)).outside(values.value))) / seeds
     hits, times, sizes = 0, 0, 0
     for _ in range(seeds):
         values = made(rng, count, tau, SLOPE)

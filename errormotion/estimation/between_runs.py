@@ -114,10 +114,8 @@ def fit_runs(X: Array, y: Array, V0: Array, time: Array | None = None) -> RunFit
     weight = np.exp(np.array(logs) - max(logs))
     weight /= weight.sum()
     best = int(np.argmax(weight))
-    mean: Array = sum(w * b for w, (b, _, _) in zip(weight, fits, strict=True))  # type: ignore[assignment]
-    whole: Array = sum(  # type: ignore[assignment]
-        w * (C + np.outer(b - mean, b - mean)) for w, (b, C, _) in zip(weight, fits, strict=True)
-    )
+    mean: Array = sum(w * b for w, (b, _, _) in zip(weight, fits, strict=True))
+    whole: Array = sum(w * (C + np.outer(b - mean, b - mean)) for w, (b, C, _) in zip(weight, fits, strict=True))
     quantile = float(stdtrit(n - p, 0.5 + COVERAGE / 2))
     spread: Array = np.sqrt(np.einsum("ni,ij,nj->n", X, whole, X))
     below = float(chdtr(n - p, chi2))

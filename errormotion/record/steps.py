@@ -297,14 +297,14 @@ class _Metric:
 
     def _rest(self, values: Array) -> tuple[Array, Array]:
         """Return whitened values (m, n), and their residuals."""
-        white = values @ self._inverse.T
-        return white, white - (white @ self._Q) @ self._Q.T
+        white: Array = values @ self._inverse.T
+        rest: Array = white - (white @ self._Q) @ self._Q.T
+        return white, rest
 
     def log_likelihood(self, values: Array) -> Array:
         """Return the log likelihood of each row of values (m, n) without a candidate, the scale being eliminated."""
         square = (self._rest(values)[1] ** 2).sum(axis=1)
-        found: Array = self._constant - 0.5 * values.shape[1] * np.log(np.maximum(square, TINY))
-        return found
+        return np.asarray(self._constant - 0.5 * values.shape[1] * np.log(np.maximum(square, TINY)), dtype=float)
 
     def gains(self, values: Array, index: Array, single: Array) -> Array:
         """Return the increase of the log likelihood of each row (m, n) by each candidate."""
