@@ -169,7 +169,8 @@ class Setup:
             raise MethodError(
                 f"{name}: no reading from {-self.layout.search * 1e3:g} to {self.layout.search * 1e3:g} mm along the "
                 f"beam about the stage position {_mm(self.start())} mm. Check layout.start or layout.pivot, the "
-                "nominal direction, and the setting of the gauge; or increase layout.search."
+                "nominal direction, and the setting of the gauge; or increase layout.search.",
+                code="beam.face.no_reading",
             )
         advance = _SIGN_MOVE * self.range if reading > self.middle else -_SIGN_MOVE * self.range
         position = self.move(position + advance * forward)
@@ -178,7 +179,8 @@ class Setup:
             raise MethodError(
                 f"{name}: while the sensor moves by {advance * 1e3:g} mm towards the face the reading changes by "
                 f"{change * advance * 1e3:.3g} mm; expected {-advance * 1e3:g} mm. Check the sign of the readings, the "
-                "nominal direction, and whether the stage carries the sensor or the target (setting moves)."
+                "nominal direction, and whether the stage carries the sensor or the target (setting moves).",
+                code="beam.sensor.gain",
             )
         for _ in range(_CENTRING_MOVES):
             off = self.read() - self.middle
@@ -260,6 +262,7 @@ def control_of(bench: Bench) -> Any:
         raise MethodError(
             "Expected an instrument of kind 'controller' that can move the sensor to a position (move_to) over the "
             "faces of the gauge; the bench has none. Measure manually, write the readings to a table, and use "
-            "'errormotion identify READINGS.csv'."
+            "'errormotion identify READINGS.csv'.",
+            code="bench.controller.no_moves",
         )
     return control

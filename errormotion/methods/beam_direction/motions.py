@@ -64,7 +64,8 @@ def search_start(settings: Settings, middle: float) -> Array:
     if p.pivot is None or p.nominal_origin is None:
         raise MethodError(
             "The start position of the search is unknown: expected layout.start (a position of the stage), or both "
-            "layout.pivot and layout.nominal_origin; found neither."
+            "layout.pivot and layout.nominal_origin; found neither.",
+            code="beam.search.start_unknown",
         )
     u = np.array(p.nominal_direction, np.float64)
     sign = 1.0 if settings.moves == "sensor" else -1.0

@@ -167,7 +167,8 @@ def raw(
         if stage.ndim not in (2, 3) or stage.shape[-1] != 3 or (stage.ndim == 3 and len(stage) != len(planes)):
             raise BenchError(
                 f"Expected stage positions (reading, 3), or (plane, reading, 3) for {len(planes)} planes; found "
-                f"{stage.shape}."
+                f"{stage.shape}.",
+                code="simulation.stage.shape",
             )
         positions = np.broadcast_to(stage, (len(planes), *stage.shape[-2:])).copy()
     reader = _Readings(sensor, seed, inclination_error, speckle, machine.sensors_on_for)
@@ -316,12 +317,13 @@ def _bar_stage(sensor: PointSensor, bar: CheckBar, count: int, half_width: float
     if not 0 < half_width < bar.certified_radius:
         raise BenchError(
             f"half_width: expected a positive length below the radius of the bar, {bar.certified_radius * 1e3:g} mm; "
-            f"found {half_width * 1e3:g} mm."
+            f"found {half_width * 1e3:g} mm.",
+            code="simulation.bar.half_width",
         )
     u, axis = sensor.nominal_direction, bar.nominal_axis
     towards = u - (u @ axis) * axis
     if not np.linalg.norm(towards) > 0.1:
-        raise BenchError("Expected a beam across the bar; found one parallel to it.")
+        raise BenchError("Expected a beam across the bar; found one parallel to it.", code="simulation.bar.parallel")
     towards = towards / np.linalg.norm(towards)
     sag = bar.certified_radius - np.sqrt(bar.certified_radius**2 - half_width**2)
     nearest = bar.point - bar.certified_radius * towards

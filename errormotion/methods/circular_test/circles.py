@@ -123,7 +123,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Circles:
     """
     labels = sorted(map(str, raw["direction_of_travel"].values)) if "direction_of_travel" in raw.coords else []
     if labels != sorted(DIRECTIONS):
-        raise MethodError(f"direction_of_travel: expected the labels CCW and CW; found {', '.join(labels) or 'none'}")
+        raise MethodError(
+            f"direction_of_travel: expected the labels CCW and CW; found {', '.join(labels) or 'none'}",
+            code="circle.direction.labels",
+        )
     ordered = raw.sel(direction_of_travel=list(DIRECTIONS))
     plane, axes = _plane(raw)
 
@@ -140,10 +143,15 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Circles:
         time = over_readings("reading_time")
         length[~np.isfinite(time)] = np.nan
     if not np.isfinite(length).any(axis=(1, 2)).all():
-        raise MethodError("length: expected readings in both directions of travel; found none in one or both")
+        raise MethodError(
+            "length: expected readings in both directions of travel; found none in one or both",
+            code="circle.readings.one_direction",
+        )
     for name in ("nominal_radius", "feed"):
         if not float(raw[name]) > 0:
-            raise MethodError(f"{name}: expected a value above 0; found {float(raw[name]):g}")
+            raise MethodError(
+                f"{name}: expected a value above 0; found {float(raw[name]):g}", code="raw.value.not_positive"
+            )
     corrected = "temperature" in raw and "expansion" in raw
     if "temperature" in raw and not corrected:
         notes.append("The temperature of the bar is not corrected: its expansion coefficient is not stated.")
@@ -152,7 +160,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Circles:
         at = scalar("calibration_temperature", REFERENCE_TEMPERATURE)
         excess = ordered["temperature"].transpose(*READINGS[:2]).values - at
         if not np.isfinite(excess).all():
-            raise MethodError("temperature: expected one of the bar for each circle; found NaN. Omit the variable")
+            raise MethodError(
+                "temperature: expected one of the bar for each circle; found NaN. Omit the variable",
+                code="circle.temperature.missing",
+            )
     return Circles(
         length=length,
         angle=np.mod(np.where(np.isfinite(angle), angle, 0.0), TAU),
@@ -181,10 +192,14 @@ def _plane(raw: xr.Dataset) -> tuple[str, Array]:
     plane = "".join(names)
     if plane not in PLANES:
         raise MethodError(
-            f"axis: expected the two axes of the circle in the order X Y, Y Z or Z X; found {' '.join(names)}"
+            f"axis: expected the two axes of the circle in the order X Y, Y Z or Z X; found {' '.join(names)}",
+            code="circle.axes.order",
         )
     if not np.allclose(axes @ axes.T, np.eye(2), atol=1e-3):
-        raise MethodError("axis_direction: expected two unit vectors at right angles to one another")
+        raise MethodError(
+            "axis_direction: expected two unit vectors at right angles to one another",
+            code="circle.axes.not_orthogonal",
+        )
     return plane, axes
 
 
@@ -333,7 +348,10 @@ def _noise(
         estimated = float(np.sqrt(np.median(squares / usual)))
     if not np.isfinite(stated):
         if not np.isfinite(estimated):
-            raise MethodError("length_noise: expected the standard deviation of a reading; too few readings to find it")
+            raise MethodError(
+                "length_noise: expected the standard deviation of a reading; too few readings to find it",
+                code="raw.noise.unknown",
+            )
         return estimated
     if settings.noise == "auto" and np.isfinite(estimated):
         limit = np.sqrt(stats.chi2.ppf(1 - FALSE_ALARM, 0.4 * degrees) / (0.4 * degrees))
@@ -377,5 +395,6 @@ def _check_gaps(count: NDArray[np.intp], places: int, settings: Settings) -> Non
         if gap > np.degrees(settings.largest_gap):
             raise MethodError(
                 f"{name}: expected a full circle with no gap above {np.degrees(settings.largest_gap):.3g} degrees; "
-                f"found one of {gap:.3g} degrees. Arcs are not evaluated."
+                f"found one of {gap:.3g} degrees. Arcs are not evaluated.",
+                code="circle.gap.too_large",
             )

@@ -46,7 +46,10 @@ def expected(settings: Settings) -> xr.Dataset:
         No ``positions`` in the settings.
     """
     if not settings.positions:
-        raise MethodError("A plan needs the positions of the artefacts: set positions, such as ['350 mm', '550 mm']")
+        raise MethodError(
+            "A plan needs the positions of the artefacts: set positions, such as ['350 mm', '550 mm']",
+            code="scan.positions.missing",
+        )
     positions, time = np.array(settings.positions), np.array([0.0, *settings.warm_up])
     stated = settings.profiler_pose or PoseSettings()
     pose, lever = stated_pose(stated), np.array(settings.lever)
@@ -147,7 +150,8 @@ def plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     if np.linalg.cond(information * np.outer(scale, scale)) > _SINGULAR:
         raise MethodError(
             "These scans of the pocket do not determine the pose of the profiler: expected at least two lifts of the "
-            f"spindle (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}."
+            f"spindle (pocket_lifts), or an angle_prior; found {len(settings.pocket_lifts)}.",
+            code="scan.pocket.undetermined",
         )
     covariance = (np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))[:6, :6]
     edge = calibration.EDGE_UNCERTAINTY

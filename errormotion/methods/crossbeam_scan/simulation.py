@@ -186,15 +186,19 @@ def raw_scans(
     """
     _need_crossbeam(machine)
     if motion not in ("axis", "rigid"):
-        raise BenchError(f"The motion of a scan is 'axis' or 'rigid'; found {motion!r}.")
+        raise BenchError(f"The motion of a scan is 'axis' or 'rigid'; found {motion!r}.", code="simulation.scan.motion")
     if profiles < 2 or not feed > 0:
-        raise BenchError(f"A scan needs at least two lines and a feed above 0; found {profiles}, {feed} m.")
+        raise BenchError(
+            f"A scan needs at least two lines and a feed above 0; found {profiles}, {feed} m.",
+            code="simulation.scan.size",
+        )
     beam, t, position = machine.crossbeam, _vector(times), _vector(positions)
     reach = profiles * feed / 2
     if position.min() - reach < beam.travel[0] or position.max() + reach > beam.travel[1]:
         raise BenchError(
             f"The axis travels from {beam.travel[0]} to {beam.travel[1]} m; the scans reach from "
-            f"{position.min() - reach:.3f} to {position.max() + reach:.3f} m."
+            f"{position.min() - reach:.3f} to {position.max() + reach:.3f} m.",
+            code="simulation.scan.outside_travel",
         )
     artefact, profiler = artefact or swept(), profiler or Profiler()
     shape = (t.size, position.size, profiles)
@@ -280,7 +284,10 @@ def raw_pocket(
 
 def _need_crossbeam(machine: VirtualMachine) -> None:
     if machine.kind != "gantry":
-        raise BenchError(f"Only the virtual machine 'gantry' has a crossbeam; this one is '{machine.kind}'.")
+        raise BenchError(
+            f"Only the virtual machine 'gantry' has a crossbeam; this one is '{machine.kind}'.",
+            code="simulation.machine.no_crossbeam",
+        )
 
 
 def _attributes(machine: VirtualMachine) -> dict[str, str]:

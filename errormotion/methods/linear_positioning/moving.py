@@ -38,7 +38,9 @@ class Cycle:
 def moving_of(settings: Settings) -> Moving:
     """Return the settings of the moving axis; MethodError if there are none."""
     if settings.moving is None:
-        raise MethodError("moving: expected the settings of the moving axis; found none")
+        raise MethodError(
+            "moving: expected the settings of the moving axis; found none", code="moving_axis.settings.missing"
+        )
     return settings.moving
 
 
@@ -57,7 +59,8 @@ def check_limits(settings: Settings, low: float, high: float) -> None:
             overrun = "" if settings.moving is not None else f", with an overrun of {settings.overrun * 1e3:g} mm"
             raise MethodError(
                 f"limits: expected {settings.axis} from {lowest * 1e3:.3f} to {highest * 1e3:.3f} mm; the test needs "
-                f"{low * 1e3:.3f} to {high * 1e3:.3f} mm{overrun}. Shorten the travel of the test."
+                f"{low * 1e3:.3f} to {high * 1e3:.3f} mm{overrun}. Shorten the travel of the test.",
+                code="motion.limit.position",
             )
 
 

@@ -148,7 +148,7 @@ def _text(log: Path) -> str:
     try:
         data = read_bytes(log, MAX_FILE_SIZE)
     except OSError as error:
-        raise DatasetError(f"{log} cannot be read: {error.strerror or error}") from None
+        raise DatasetError(f"{log} cannot be read: {error.strerror or error}", code="file.unreadable") from None
     return decode(data, "auto", log)[0]
 
 

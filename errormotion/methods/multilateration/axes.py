@@ -42,10 +42,11 @@ def volume_of(chain: str, position: Array, reflector: Array) -> Volume:
     try:
         machine = Machine(chain, dict.fromkeys(AXES, reference))
     except ValueError as error:
-        raise MethodError(f"Chain of the machine: {error}") from error
+        raise MethodError(f"Chain of the machine: {error}", code="network.chain.form") from error
     if machine.axis_names != AXES:
         raise MethodError(
-            f"Parametric errors: expected a machine with the axes X, Y and Z; found {', '.join(machine.axis_names)}"
+            f"Parametric errors: expected a machine with the axes X, Y and Z; found {', '.join(machine.axis_names)}",
+            code="network.chain.axes",
         )
     return Volume.of(machine, position)
 
@@ -91,7 +92,10 @@ def fit_machine(
     """
     known = np.flatnonzero(np.isfinite(error).all(axis=1) & np.isfinite(own).all(axis=(1, 2)))
     if len(known) < 10:
-        raise MethodError(f"Parametric errors: expected at least ten known targets; found {len(known)}. Measure more.")
+        raise MethodError(
+            f"Parametric errors: expected at least ten known targets; found {len(known)}. Measure more.",
+            code="network.targets.too_few",
+        )
     at = np.zeros_like(position) if reflector is None else reflector
     q, tool = position[known], at[known]
     targets = Targets(q, tool, error[known], own[known], influence[:, known])
@@ -200,7 +204,8 @@ def axes_of(errors: xr.Dataset) -> AxisErrors:
     if "coefficient" not in errors:
         raise MethodError(
             "The dataset contains no errors of the axes. Identify the raw data with the chain of the machine (setting "
-            "'chain')."
+            "'chain').",
+            code="network.no_errors_of_axes",
         )
     c = errors["coefficient"]
     pairs = zip(c["term_error"].values, c["term_order"].values, strict=True)
@@ -245,7 +250,10 @@ def volumetric_errors(errors: xr.Dataset, position: ArrayLike, tool: ArrayLike |
     axes = axes_of(errors)
     q = np.atleast_2d(np.asarray(position, dtype=float))
     if q.ndim != 2 or q.shape[1] != 3 or not np.isfinite(q).all():
-        raise MethodError(f"position: expected finite axis positions (k, 3) in m; found shape {q.shape}, or NaN")
+        raise MethodError(
+            f"position: expected finite axis positions (k, 3) in m; found shape {q.shape}, or NaN",
+            code="network.position.form",
+        )
     at = reference_of(axes) if tool is None else np.asarray(tool, dtype=float)
     A = _field(axes, q, at)
     values = A @ axes.coefficient

@@ -57,14 +57,16 @@ def refuse_too_few(used: NDArray[np.bool_], approximate: Array | None, target: A
     if n < 4:
         raise MethodError(
             f"Expected at least four stations; found {n}. With three every target has as many unknowns as distances, "
-            "so that the stations are not determined. Measure the targets from a further station."
+            "so that the stations are not determined. Measure the targets from a further station.",
+            code="network.stations.too_few",
         )
     blind = np.flatnonzero(by_station < 4)
     if len(blind):
         raise MethodError(
             f"Expected at least 4 readings of every station; found "
             f"{', '.join(f'{by_station[j]} of station {j + 1}' for j in blind)} for targets with a position. "
-            + _cause(approximate, target, "Measure more targets from it, or remove the station.")
+            + _cause(approximate, target, "Measure more targets from it, or remove the station."),
+            code="network.station.readings_too_few",
         )
     equations, needed = int(np.maximum(by_target - 3, 0).sum()), 4 * n - 6
     if equations < needed:
@@ -74,7 +76,8 @@ def refuse_too_few(used: NDArray[np.bool_], approximate: Array | None, target: A
             f"for {needed} unknowns of the stations (positions and dead paths); found {equations} equations from {m} "
             f"targets, {int(np.count_nonzero(by_target == n))} of them measured from all stations and "
             f"{int(np.count_nonzero(by_target < 3))} without a position. "
-            + _cause(approximate, target, "Measure more targets.")
+            + _cause(approximate, target, "Measure more targets."),
+            code="network.targets.few_common",
         )
 
 
@@ -109,7 +112,7 @@ def lost_targets(known: NDArray[np.bool_], e: Array, sd: Array) -> NDArray[np.bo
         few = np.count_nonzero(known, axis=0) < 3
         A[few] = np.eye(3)
         if not np.isfinite(A).all():
-            raise FitError(NOT_FINITE)
+            raise FitError(NOT_FINITE, code="network.distances.zero")
         # sum(1 / eigenvalue) = second invariant / determinant
         trace, determinant = np.trace(A, axis1=1, axis2=2), np.linalg.det(A)
         second = (trace**2 - np.einsum("tab,tab->t", A, A)) / 2
@@ -133,7 +136,7 @@ def condition(fit: Fit, approximate: Array) -> float:
     stations = Stations(x.station[:, :3], x.station[:, 3])
     found = _freedoms(fit.normal.S, fit.normal.F, stations, x.target, free)
     if found[3].any():
-        raise FitError(_described(found, stations, x.target[free], approximate))
+        raise FitError(_described(found, stations, x.target[free], approximate), code="network.undetermined")
     return float(found[0][-1] / found[0][0])
 
 
@@ -160,7 +163,7 @@ def _freedoms(
     In the datum of a few targets an undetermined station moves alone.
     """
     if not (np.isfinite(S).all() and np.isfinite(target).all()):
-        raise FitError(NOT_FINITE)
+        raise FitError(NOT_FINITE, code="network.distances.zero")
     some = np.flatnonzero(free)
     some = some[:: max(1, len(some) // DATUM_SAMPLE)]
     information, basis = without_motions(S, F[some], stations, target[some])

@@ -136,7 +136,7 @@ def network(
     try:
         problem = structure(_stated(reading, sd, nominal, start, sources or Sources(), noise_freedom))
     except FitError as error:
-        raise MethodError(str(error)) from error
+        raise MethodError(str(error), code=error.code) from error
     defaults: dict[str, Any] = {
         "coords": {},
         "functional_point": np.zeros(3),
@@ -188,7 +188,7 @@ def _structure(nominal: Array, start: Stations, e: Array, sd: Array) -> Callable
         try:
             determinacy.refuse_too_few(known & ~lost, start.position, nominal)
         except MethodError as error:
-            raise FitError(str(error)) from error
+            raise FitError(str(error), code=error.code) from error
         target = changed(problem.unknowns.target, free=~lost)
         readings = np.where(lost, np.nan, problem.readings.reshape(sd.shape)).ravel()
         return changed(problem, readings=readings, unknowns=problem.unknowns._replace(target=target))

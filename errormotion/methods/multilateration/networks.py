@@ -136,11 +136,15 @@ def solve(
     if d.ndim != 2 or u.shape != (d.shape[1], 3):
         raise MethodError(
             f"Expected displacements (station, target) and targets (target, 3); found {d.shape} and {u.shape}. "
-            "State a row of displacements for every station and a position for every target."
+            "State a row of displacements for every station and a position for every target.",
+            code="network.shape",
         )
     sd = np.broadcast_to(np.asarray(noise, dtype=float), d.shape)
     if not (sd > 0).all():
-        raise MethodError("Expected a positive standard deviation of every reading. State the instrument's noise, m.")
+        raise MethodError(
+            "Expected a positive standard deviation of every reading. State the instrument's noise, m.",
+            code="network.noise.not_positive",
+        )
     known = np.isfinite(d)
     determinacy.refuse_too_few(known & (known.sum(axis=0) >= 3), None, u)
     start = initial_stations(
@@ -183,9 +187,14 @@ def bound(
     """
     u, U = np.asarray(target, dtype=float), np.asarray(station, dtype=float)
     if u.ndim != 2 or u.shape[1] != 3 or U.ndim != 2 or U.shape[1] != 3:
-        raise MethodError(f"Expected positions (target, 3) and (station, 3); found {u.shape} and {U.shape}.")
+        raise MethodError(
+            f"Expected positions (target, 3) and (station, 3); found {u.shape} and {U.shape}.", code="network.shape"
+        )
     if not (np.isfinite(u).all() and np.isfinite(U).all()):
-        raise MethodError("Expected finite positions of targets and stations; found NaN or infinite ones.")
+        raise MethodError(
+            "Expected finite positions of targets and stations; found NaN or infinite ones.",
+            code="network.position.form",
+        )
     stations = Stations(U, np.zeros(len(U)))
     d = readings(u, stations)
     if seen is not None:

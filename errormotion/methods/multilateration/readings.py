@@ -91,16 +91,22 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
     noise = float(raw["displacement_noise"])
     if not noise > 0:
         raise MethodError(
-            f"displacement_noise: expected a positive standard deviation; found {noise:g} m. State that of the tracker."
+            f"displacement_noise: expected a positive standard deviation; found {noise:g} m. State that of "
+            "the tracker.",
+            code="raw.noise.not_positive",
         )
     if not np.isfinite(d).any():
-        raise MethodError("displacement: expected readings; found only NaN. Check that the beam was not broken.")
+        raise MethodError(
+            "displacement: expected readings; found only NaN. Check that the beam was not broken.",
+            code="network.no_readings",
+        )
     names = {dim: _names(raw, dim, letter) for dim, letter in (("station", "S"), ("target", "T"))}
     empty = [name for name, row in zip(names["station"], d, strict=True) if not np.isfinite(row).any()]
     if empty:
         raise MethodError(
             f"displacement: expected readings of every station; found none of {', '.join(empty)}. Remove the station, "
-            "or measure from it."
+            "or measure from it.",
+            code="network.station.no_readings",
         )
     few = np.flatnonzero(np.count_nonzero(np.isfinite(d), axis=0) < 3)
     if few.size:
@@ -118,7 +124,10 @@ def read(raw: xr.Dataset, notes: list[str]) -> Readings:
     if "reflector" in raw:
         reflector = _array(raw, "reflector", "target", "direction")
         if np.isnan(reflector).any():
-            raise MethodError("reflector: expected a position for every target; found NaN. Omit it if it is unknown.")
+            raise MethodError(
+                "reflector: expected a position for every target; found NaN. Omit it if it is unknown.",
+                code="network.reflector.unknown",
+            )
     else:
         reflector = np.zeros_like(nominal)
     timed = "reading_time" in raw

@@ -115,7 +115,8 @@ def _checked(*arguments: ArrayLike) -> list[Array]:
         wrong = value[(value < low) | (value > high)]
         if wrong.size:
             raise MethodError(
-                f"Refraction: expected {name} from {low:g} to {high:g} {unit}; found {float(wrong.flat[0]):g}."
+                f"Refraction: expected {name} from {low:g} to {high:g} {unit}; found {float(wrong.flat[0]):g}.",
+                code="network.air.outside",
             )
     return values
 

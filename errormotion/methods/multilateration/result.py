@@ -272,7 +272,8 @@ class _Finish:
                     f"Expected every station at rest; station {name} was moved by about "
                     f"{float(np.linalg.norm(each.size[:3])) * 1e3:.3g} mm before target {target}. Measure this set-up "
                     "again, or state its readings from this target on as a separate station. A drifting set-up has the "
-                    "same effect: measure some of its targets twice."
+                    "same effect: measure some of its targets twice.",
+                    code="network.station.moved",
                 )
 
     def _of_targets(self, solved: Solved, free: NDArray[np.bool_]) -> list[str]:

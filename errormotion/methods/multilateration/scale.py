@@ -51,7 +51,8 @@ def air_scale(raw: xr.Dataset, air: Air, notes: list[str]) -> tuple[Array | floa
         if "refractive_index" in raw:
             raise MethodError(
                 "The data state the refractive index of the displacements, which are therefore corrected again: "
-                f"expected {', '.join(missing)} (station, target). Add them, or omit refractive_index."
+                f"expected {', '.join(missing)} (station, target). Add them, or omit refractive_index.",
+                code="network.air.incomplete",
             )
         notes.append(
             "The state of the air is not in the data: displacements are assumed to be compensated for it. An error of "
@@ -98,10 +99,13 @@ def _refuse_unknown_air(raw: xr.Dataset, air: dict[str, Array]) -> None:
             raise MethodError(
                 f"{name}: expected a value for every reading, since displacements are corrected again for the air; "
                 f"found NaN at {int(unknown.sum())} of {int(read.sum())}, first at {first[0]}, {first[1]}. Add the "
-                "values, or omit refractive_index."
+                "values, or omit refractive_index.",
+                code="network.air.unknown",
             )
         if not np.isfinite(value).any():
-            raise MethodError(f"{name}: expected numbers; found only NaN. Omit it if it is unknown.")
+            raise MethodError(
+                f"{name}: expected numbers; found only NaN. Omit it if it is unknown.", code="raw.value.unknown"
+            )
 
 
 def scale_strain(raw: xr.Dataset, expansion: Expansion) -> tuple[Array, Array]:
@@ -119,11 +123,15 @@ def scale_strain(raw: xr.Dataset, expansion: Expansion) -> tuple[Array, Array]:
     else:
         raise MethodError(
             "Expansion of the scales: expected their temperature, scale_temperature(station, direction) in the data or "
-            "expansion.temperature in the settings; found neither."
+            "expansion.temperature in the settings; found neither.",
+            code="expansion.temperature.missing",
         )
     if np.isnan(T).any():
         station = str(raw["station"].values[np.argwhere(np.isnan(T))[0, 0]]) if "station" in raw.coords else "one"
-        raise MethodError(f"Expansion of the scales: expected their temperature at station {station}; found NaN.")
+        raise MethodError(
+            f"Expansion of the scales: expected their temperature at station {station}; found NaN.",
+            code="expansion.temperature.missing",
+        )
     excess = T - expansion.reference
     return excess, expansion.coefficient * excess
 

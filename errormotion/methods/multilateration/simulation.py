@@ -209,5 +209,6 @@ def _require_within_travel(machine: VirtualMachine, q: Array) -> None:
         if column.min() < low - 1e-9 or column.max() > high + 1e-9:
             raise BenchError(
                 f"Axis {axis}: expected targets within the travel, {low:g} to {high:g} m; found {column.min():g} to "
-                f"{column.max():g} m."
+                f"{column.max():g} m.",
+                code="simulation.targets.outside_travel",
             )

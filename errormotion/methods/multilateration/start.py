@@ -78,7 +78,8 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     n = len(reading)
     if station is not None and station.shape != (n, 3):
         raise MethodError(
-            f"Expected approximate positions ({n}, 3) of the stations, one per row; found {station.shape}."
+            f"Expected approximate positions ({n}, 3) of the stations, one per row; found {station.shape}.",
+            code="network.stations.shape",
         )
     centre, extent, products = _shape(target, _spread(len(target), 4 * MAX_READINGS).step)
     values, axes = np.linalg.eigh(products)
@@ -86,7 +87,8 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
     if spread[1] < FLAT:
         raise MethodError(
             "Expected targets distributed in space; found them on one line, about which distances do not determine the "
-            "rotation of the stations. Add targets off that line."
+            "rotation of the stations. Add targets off that line.",
+            code="network.targets.on_line",
         )
     normal = axes[:, 0] if spread[2] < FLAT else None
     positions, dead_paths = np.empty((n, 3)), np.empty(n)
@@ -101,7 +103,8 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
             if approximate is None:
                 raise MethodError(
                     f"Expected at least 5 readings of station {j + 1} without approximate position; found {len(d)}. "
-                    "Measure more targets from it, or state its approximate position."
+                    "Measure more targets from it, or state its approximate position.",
+                    code="network.station.readings_too_few",
                 )
             positions[j], dead_paths[j] = approximate + centre, np.median(np.linalg.norm(u - approximate, axis=1) - d)
             continue
@@ -109,7 +112,7 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
         if scale > MAX_MISFIT * extent and normal is None:
             found, scale = min((found, scale), _best(_from_subsets(d, u), d, u), key=lambda each: each[1])
         if scale > MAX_MISFIT * extent or _reversed(d, u, found, normal, scale):
-            raise MethodError(_misfit_message(j, d, u, extent, scale))
+            raise MethodError(_misfit_message(j, d, u, extent, scale), code="network.station.misfit")
         positions[j], dead_paths[j] = found[:3] + centre, found[3]
     return Stations(positions, dead_paths)
 
@@ -191,7 +194,8 @@ def _off_plane(d: Array, u: Array, approximate: Array | None, normal: Array) -> 
         raise MethodError(
             "Expected targets distributed in space, or approximate positions of the stations; found targets in one "
             "plane, where distances do not determine on which side a station is. State approximate positions, or "
-            "measure targets off that plane."
+            "measure targets off that plane.",
+            code="network.targets.in_plane",
         )
     side = -1.0 if approximate is not None and normal @ approximate < 0 else 1.0
     return np.append(U + side * height * normal, L - middle)

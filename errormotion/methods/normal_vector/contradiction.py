@@ -50,7 +50,8 @@ def contradiction(solved: Solved, probing: Probing, smallest_move: float) -> str
     raise MethodError(
         f"The touches contradict tool_axes = {stated}, the axes that carry the tool: balls seem to move, or touches "
         f"scatter. All of them agree with {other}. State the axes that carry the tool (attribute tool_axes of the "
-        "data, which has priority, or the setting)."
+        "data, which has priority, or the setting).",
+        code="probing.tool_axes.contradicted",
     )
 
 

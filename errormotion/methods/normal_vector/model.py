@@ -83,7 +83,7 @@ def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Probing]:
     try:
         problem = probing.determined(probing.problem())
     except FitError as error:
-        raise MethodError(f"{error}.") from error
+        raise MethodError(f"{error}.", code=error.code) from error
     k = len(data.seen.cycle_time)
     reference = "cold" if settings.reference == "cold" else "first"
     observed = Observed(
@@ -236,12 +236,14 @@ class Probing:
         if not usable[0]:
             raise FitError(
                 "the cold cycle alone does not determine the positions of the balls: too many of its touches are "
-                "missing or outliers. Probe the cold machine again, or use a later cycle as the reference"
+                "missing or outliers. Probe the cold machine again, or use a later cycle as the reference",
+                code="probing.cold.undetermined",
             )
         used = np.flatnonzero(usable)
         if used.size < 2:
             raise FitError(
-                "expected the cold cycle and at least one more; found 1 that determines the motion. Repeat the probing"
+                "expected the cold cycle and at least one more; found 1 that determines the motion. Repeat the probing",
+                code="probing.cycles.too_few",
             )
         cycle, _, reach = self._index
         lost = ~usable[cycle] | np.isnan(problem.readings).any(axis=1)
@@ -358,7 +360,9 @@ def _motion(data: Readings, settings: Settings) -> Motion:
     ever = np.any(seen.valid, axis=(0, 2))
     if not ever.all():
         lost = ", ".join(name for name, touched in zip(names, ever, strict=True) if not touched)
-        raise MethodError(f"Ball {lost} was never touched: remove it from the data, or touch it.")
+        raise MethodError(
+            f"Ball {lost} was never touched: remove it from the data, or touch it.", code="probing.ball.not_touched"
+        )
     check_jumps(seen, names, settings.ball_tolerance)
     if seen.touched:
         touched = seen.valid.any(axis=0).sum(axis=1)
@@ -366,7 +370,8 @@ def _motion(data: Readings, settings: Settings) -> Motion:
             i = int(np.argmin(touched))
             raise MethodError(
                 f"Ball {names[i]} was touched in {touched[i]} directions; a sphere needs four, preferably five: "
-                "around it and on top."
+                "around it and on top.",
+                code="probing.ball.directions_too_few",
             )
         centre, radius = seen.spheres
     else:

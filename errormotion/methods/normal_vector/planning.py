@@ -49,7 +49,8 @@ def expected(settings: Settings) -> xr.Dataset:
     if count < 2:
         raise MethodError(
             f"Expected the cold cycle and at least one more; a warm-up of {settings.duration:g} s has none at an "
-            f"interval of {settings.interval:g} s."
+            f"interval of {settings.interval:g} s.",
+            code="probing.cycles.too_few",
         )
     radius = np.array([ball.radius for ball in settings.balls])
     tip = settings.tip_radius or TIP_RADIUS

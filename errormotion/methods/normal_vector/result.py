@@ -122,7 +122,7 @@ def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequen
         return replace(solved, relative=replace(solved.relative, errors=best))
     other, why = _published(probing, solved, seen, excluded, anchor, reach, settings, noise)
     if settings.procedure == "normals" and other is None:
-        raise MethodError("procedure = normals: " + why)
+        raise MethodError("procedure = normals: " + why, code="probing.normals.not_possible")
     chosen = best if other is None or settings.procedure == "rigid" else other
     time = _times(probing, seen, excluded)
     several = (

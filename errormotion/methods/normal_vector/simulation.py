@@ -61,7 +61,10 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """
     kinds = {"XYZ": "gantry", "Z": "cframe"}
     if settings.tool_axes not in kinds:
-        raise MethodError(f"tool_axes: expected XYZ or Z for a simulation; found '{settings.tool_axes}'.")
+        raise MethodError(
+            f"tool_axes: expected XYZ or Z for a simulation; found '{settings.tool_axes}'.",
+            code="probing.tool_axes.form",
+        )
     machine = VirtualMachine(kinds[settings.tool_axes], seed=seed)
     balls, touches = max(BALLS, len(settings.balls)), max(len(_AROUND_AND_TOP), settings.touches)
     cycle = TOUCH_TIME * balls * touches
@@ -152,7 +155,7 @@ def raw(
         variables |= _centres(cycles, table, contacts, sigma, rng)
         coords["direction_"] = list("xyz")
     else:
-        raise BenchError(f"variant: expected 'touches' or 'centres'; found {variant!r}.")
+        raise BenchError(f"variant: expected 'touches' or 'centres'; found {variant!r}.", code="simulation.variant")
     address = f"twin://{machine.kind}?seed={machine.seed}"
     attrs: Mapping[str, Any] = {
         "schema": SCHEMA,
@@ -167,7 +170,10 @@ def raw(
 def touch_normals(count: int) -> Array:
     """Return the outward unit normals at which a ball is touched, (count, 3)."""
     if count < len(_AROUND_AND_TOP):
-        raise BenchError(f"touches: expected {len(_AROUND_AND_TOP)} or more for each ball; found {count}.")
+        raise BenchError(
+            f"touches: expected {len(_AROUND_AND_TOP)} or more for each ball; found {count}.",
+            code="simulation.touches.count",
+        )
     more = count - len(_AROUND_AND_TOP)
     azimuth = np.pi / 4 + 2 * np.pi * np.arange(more) / max(more, 1)
     slanting = np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(more)], axis=1) / np.sqrt(2)
@@ -210,12 +216,17 @@ class Cycles:
         if not duration >= 0 or not np.all(np.isfinite(starts)) or np.any(np.diff(starts) < max(duration, 1e-9)):
             raise BenchError(
                 f"times: expected increasing starts at least {duration:g} s apart, the duration of a cycle; found "
-                f"{starts} s."
+                f"{starts} s.",
+                code="simulation.times.not_increasing",
             )
         if not 0 <= missing <= 1:
-            raise BenchError(f"missing: expected a fraction from 0 to 1; found {missing:g}.")
+            raise BenchError(
+                f"missing: expected a fraction from 0 to 1; found {missing:g}.", code="simulation.missing.fraction"
+            )
         if moved is not None and not 0 <= moved[0] < balls:
-            raise BenchError(f"moved: expected a ball from 0 to {balls - 1}; found {moved[0]}.")
+            raise BenchError(
+                f"moved: expected a ball from 0 to {balls - 1}; found {moved[0]}.", code="simulation.ball.number"
+            )
         return cls(starts, touch_normals(touches), int(balls), duration, moved, float(missing))
 
     @property

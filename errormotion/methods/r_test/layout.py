@@ -81,16 +81,20 @@ class Layout:
         """
         axis = str(raw.attrs.get("axis", ""))
         if axis not in ROTARY_AXES:
-            raise MethodError(f"Attribute 'axis' of the raw data: expected A, B or C; found '{axis}'.")
+            raise MethodError(
+                f"Attribute 'axis' of the raw data: expected A, B or C; found '{axis}'.", code="raw.axis.unknown"
+            )
         if (chain := str(raw.attrs.get("chain", ""))) and parse_chain(chain).get(axis, True):
             raise MethodError(
-                f"Axis {axis} of the chain {chain} does not carry the workpiece; expected the axis of a table."
+                f"Axis {axis} of the chain {chain} does not carry the workpiece; expected the axis of a table.",
+                code="rotary.axis.no_workpiece",
             )
         angle = raw["angle"].values.astype(float)
         if angle.size < FEWEST_ANGLES or not (np.diff(angle) > 0).all():
             raise MethodError(
                 f"angle: expected at least {FEWEST_ANGLES} angles that increase; found {angle.size}. Sort the readings "
-                "by the angle, and identify each direction of rotation separately."
+                "by the angle, and identify each direction of rotation separately.",
+                code="rotary.angles.form",
             )
         vectors = {
             name: raw[name].transpose(..., "direction").values.astype(float)
@@ -100,7 +104,9 @@ class Layout:
         length = np.linalg.norm(sensor, axis=1)
         if np.abs(length - 1).max() > 1e-3:
             raise MethodError(
-                f"sensor_direction: expected unit vectors; found one of length {length[np.argmax(abs(length - 1))]:.4g}"
+                f"sensor_direction: expected unit vectors; found one of length "
+                f"{length[np.argmax(abs(length - 1))]:.4g}",
+                code="sensor.direction.form",
             )
         place = vectors["sphere_position"] - origin
         if len(place) == 1:
@@ -188,7 +194,8 @@ class Layout:
                 "EZ mixed with the rotations times its distance, two spheres show no rotation about the line through "
                 "them, and fewer than three sensors, or sensors in one plane, no displacement across them. Measure "
                 "three spheres that are not on a line with three or more sensors; or one sphere within "
-                f"{1e3 * ON_AXIS:g} mm of the axis, which shows EX, EY and EZ."
+                f"{1e3 * ON_AXIS:g} mm of the axis, which shows EX, EY and EZ.",
+                code="rotary.freedoms.none",
             )
         return np.asarray(found)
 

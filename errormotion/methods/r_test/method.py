@@ -156,7 +156,8 @@ def _problem(raw: xr.Dataset, layout: Layout) -> Problem:
     if "displacement_noise" not in raw and redundancy < 1:
         raise MethodError(
             "displacement_noise is not stated, and the displacements have no redundancy to estimate it. State it, or "
-            "measure three spheres, or one with more than three sensors."
+            "measure three spheres, or one with more than three sensors.",
+            code="raw.noise.unknown",
         )
 
     def stated(name: str, default: float = 0.0) -> float:
@@ -219,7 +220,8 @@ def _check_sense(raw: xr.Dataset, problem: Problem) -> None:
         raise MethodError(
             "The displacements fit the opposite sense of rotation. State angles as commanded (ISO 841: a positive "
             "command turns the tool in the positive direction relative to the workpiece, the table in the negative "
-            "one)."
+            "one).",
+            code="readings.sense.opposite",
         )
 
 

@@ -224,7 +224,8 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         span = float(time.size * settings.average)
         raise MethodError(
             f"The record gives {time.size} mean of {settings.average:g} s; expected at least two. "
-            f"Reduce 'average', or record longer than {2 * span:g} s."
+            f"Reduce 'average', or record longer than {2 * span:g} s.",
+            code="drift.record.too_short",
         )
     setup = Setup.of(raw, settings, notes)
     coming_up = settling(record, settings.spin_up)
@@ -236,7 +237,8 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
         if np.isnan(reading[reference]).any():
             raise MethodError(
                 f"The temperature of the frame ({settings.frame_temperature}) is unknown in the reference state. "
-                "Choose another one with reference_time and reference_average, or set compensate_frame = false."
+                "Choose another one with reference_time and reference_average, or set compensate_frame = false.",
+                code="drift.temperature.reference",
             )
     reading = np.vstack([reading, reading[reference].mean(axis=0)])
     per_kelvin = np.zeros((5, 3)) if warming is None else warming.per_kelvin
@@ -321,7 +323,8 @@ def _states(reading: Array, setup: Setup, per_kelvin: Array) -> Array:
     if not np.isfinite(state[-1]).all():
         raise MethodError(
             "No cylinder of the stated radius fits the readings of the reference state. Check bar_radius "
-            f"({setup.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams."
+            f"({setup.radius * 1e3:g} mm), the beams' origins and directions, and that the X beams cross the Y beams.",
+            code="drift.radius.no_fit",
         )
     setup.check_senses(reading[-1, :5], state[-1, :3], np.concatenate(axis_direction(state[-1:])))
     return state

@@ -157,7 +157,10 @@ def raw_drift(
         "nominal": (frame.nominal_origin, frame.nominal_direction, None),
     }
     if isinstance(beams, str) and beams not in known:
-        raise BenchError(f"beams: expected 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.")
+        raise BenchError(
+            f"beams: expected 'true', 'nominal' or (origin, direction, covariance); found {beams!r}.",
+            code="simulation.beams.form",
+        )
     origin, direction, covariance = known[beams] if isinstance(beams, str) else beams
     variables: dict[str, Any] = {
         "distance": (("channel", "time"), readings, _M),

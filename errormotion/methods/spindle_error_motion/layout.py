@@ -64,7 +64,9 @@ class Layout:
         """
         axis = str(raw.attrs.get("axis", ""))
         if axis not in ROTARY_AXES:
-            raise MethodError(f"Attribute 'axis' of the raw data: expected A, B or C; found '{axis}'.")
+            raise MethodError(
+                f"Attribute 'axis' of the raw data: expected A, B or C; found '{axis}'.", code="raw.axis.unknown"
+            )
         direction, position, origin = (
             raw[name].transpose(..., "direction").values.astype(float)
             for name in ("sensor_direction", "sensor_position", "axis_point")
@@ -73,11 +75,14 @@ class Layout:
         if np.abs(length - 1).max() > 1e-3:
             raise MethodError(
                 "sensor_direction: expected unit vectors; found one of length "
-                f"{length[np.argmax(np.abs(length - 1))]:.4g}"
+                f"{length[np.argmax(np.abs(length - 1))]:.4g}",
+                code="sensor.direction.form",
             )
         found = cls(axis, direction / length[:, None], position - origin, origin, float(raw["artefact_radius"]))
         if not found.radius > 0:
-            raise MethodError(f"artefact_radius: expected a radius above 0; found {found.radius:g}")
+            raise MethodError(
+                f"artefact_radius: expected a radius above 0; found {found.radius:g}", code="raw.value.not_positive"
+            )
         found._check()
         if found.radial.any() and found.sections.max() == 0:
             shift = found.position[found.radial][:, found.along].mean() * np.eye(3)[found.along]
@@ -92,13 +97,15 @@ class Layout:
             if RADIAL < part < AXIAL:
                 raise MethodError(
                     f"sensor_direction: expected sensors across or along axis {self.axis}; found sensor {k + 1} at "
-                    f"{np.degrees(np.arccos(part)):.3g} deg to it"
+                    f"{np.degrees(np.arccos(part)):.3g} deg to it",
+                    code="sensor.direction.skew",
                 )
             distance = float(np.linalg.norm(across))
             if part <= RADIAL and not abs(n @ across) > 0.9 * distance > 0:
                 raise MethodError(
                     f"sensor_position: expected the point of the surface that sensor {k + 1} looks at, from the axis "
-                    "along its direction; found one beside that line. State axis_point and the side of the sensor."
+                    "along its direction; found one beside that line. State axis_point and the side of the sensor.",
+                    code="sensor.position.form",
                 )
 
     @property
@@ -173,7 +180,8 @@ class Layout:
             names = ", ".join(name for name, its in zip(DOF, mixed, strict=True) if its)
             raise MethodError(
                 f"The sensors show {names or 'no freedom'} mixed with one another. Use sensors along the directions "
-                "across and along the axis, each pair at one height, or only those of one height."
+                "across and along the axis, each pair at one height, or only those of one height.",
+                code="spindle.freedoms.mixed",
             )
         return np.asarray(seen)
 

@@ -216,7 +216,10 @@ def _form(raw: xr.Dataset, roundness: float, sections: int, harmonics: int) -> t
     stated = "form_cosine" in raw and "form_sine" in raw
     given = np.asarray(raw["undulation"].values, int) if stated and "undulation" in raw else np.zeros(0, int)
     if stated and not given.size:
-        raise MethodError("undulation: expected the undulations in one turn of form_cosine and form_sine; found none")
+        raise MethodError(
+            "undulation: expected the undulations in one turn of form_cosine and form_sine; found none",
+            code="spindle.undulations.missing",
+        )
     seen = given <= harmonics
     orders = np.union1d(given[seen], np.arange(2, min(FORM, harmonics) + 1))
     value = np.zeros((sections, 2 * orders.size))
@@ -246,7 +249,8 @@ def _check_sense(layout: Layout, angle: Array, y: Array) -> None:
     if backward > WRONG_SENSE * forward and backward > 3 * np.abs(y).std(axis=1).max() / 10:
         raise MethodError(
             f"The artefact turns in the opposite sense: its eccentricity is {1e6 * backward:.3g} um against the stated "
-            f"sense and {1e6 * forward:.3g} um in it. Correct the sign of spindle_speed, or the sides of the sensors."
+            f"sense and {1e6 * forward:.3g} um in it. Correct the sign of spindle_speed, or the sides of the sensors.",
+            code="readings.sense.opposite",
         )
 
 

@@ -131,7 +131,10 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
         seen += int(np.count_nonzero((turn >= 0) & (turn < turning.turns)))
         spikes += add_up(chunk.reading, turn, turning.sense, turning.turns, limit, count, offset, square, total)
     if not count.any():
-        raise MethodError("displacement: expected samples with readings of all sensors; found none in the whole turns")
+        raise MethodError(
+            "displacement: expected samples with readings of all sensors; found none in the whole turns",
+            code="spindle.no_samples",
+        )
     variance = square / np.maximum(count, 1) - np.square(offset / np.maximum(count, 1))
     middle = (np.arange(parts) + 0.5 + offset / np.maximum(count, 1)) * TAU / parts
     means = total / np.maximum(count, 1)
@@ -170,7 +173,8 @@ def _fitted(
     K = min(wanted, int(_NYQUIST * np.pi / usual + 1e-6)) if np.isfinite(usual) else 0
     if K < 1:
         raise MethodError(
-            "The samples leave more than half of a turn without readings; expected some ten in each turn."
+            "The samples leave more than half of a turn without readings; expected some ten in each turn.",
+            code="spindle.turn.incomplete",
         )
     kept = gaps <= 1.2 * np.pi / K
     notes, doubts = list[str](), list[str]()
@@ -182,7 +186,8 @@ def _fitted(
     if kept.sum() < FEWEST_BATCHES:
         raise MethodError(
             f"Only {kept.sum()} of {kept.size} batches of turns have samples over the whole turn; expected "
-            f"{FEWEST_BATCHES} or more."
+            f"{FEWEST_BATCHES} or more.",
+            code="spindle.batches.too_few",
         )
     if not kept.all():
         notes.append(f"{(~kept).sum()} of {kept.size} batches of turns have gaps and are not used.")

@@ -103,7 +103,8 @@ def _times(raw: xr.Dataset, first: int, count: int) -> Array:
         start = float(raw.attrs.get("time_start", 0.0))
         return np.asarray(start + (first + np.arange(count)) / float(raw.attrs["sample_rate"]))
     raise MethodError(
-        "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz)."
+        "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz).",
+        code="raw.time.missing",
     )
 
 
@@ -117,7 +118,10 @@ def turning_of(raw: xr.Dataset, layout: Layout, notes: list[str]) -> Turning:
     """
     speed = float(raw["spindle_speed"])
     if not abs(speed) > 0:
-        raise MethodError("spindle_speed: expected the nominal speed of a turning spindle, with its sense; found 0")
+        raise MethodError(
+            "spindle_speed: expected the nominal speed of a turning spindle, with its sense; found 0",
+            code="spindle.speed.zero",
+        )
     if "angle" in raw:
         found = _by_encoder(raw, speed)
     elif "index_time" in raw:
@@ -127,7 +131,8 @@ def turning_of(raw: xr.Dataset, layout: Layout, notes: list[str]) -> Turning:
     if found.turns < FEWEST_TURNS:
         raise MethodError(
             f"The record has {found.turns} whole turns; expected at least {FEWEST_TURNS}, and 20 or more for the "
-            "asynchronous error motion."
+            "asynchronous error motion.",
+            code="spindle.turns.too_few",
         )
     return found
 
@@ -144,7 +149,8 @@ def _by_encoder(raw: xr.Dataset, speed: float) -> Turning:
         if (np.diff(known) * sense < -0.2).any():
             raise MethodError(
                 f"angle: expected the spindle to turn in the sense of spindle_speed ({speed:g} /min); found angles "
-                "against it. Check the sense, or omit the part where the spindle stops."
+                "against it. Check the sense, or omit the part where the spindle stops.",
+                code="spindle.angle.sense",
             )
         last = before = float(known[-1])
     start = sense * np.ceil(sense * first / TAU - 1e-9) * TAU
@@ -167,12 +173,15 @@ def _by_index(pulse: Array, speed: float, notes: list[str]) -> Turning:
     """Return the angle by pulses; where one is missing the turns are counted by the speed, a second one is dropped."""
     pulse = np.unique(pulse[np.isfinite(pulse)])
     if pulse.size < 2:
-        raise MethodError("index_time: expected the pulses of several turns; found fewer than two")
+        raise MethodError(
+            "index_time: expected the pulses of several turns; found fewer than two", code="spindle.index.missing"
+        )
     usual = float(np.median(np.diff(pulse)))
     nominal = 60.0 / abs(speed)
     if not 0.5 < usual / nominal < 1.5:
         raise MethodError(
-            f"index_time: expected pulses about {nominal:.4g} s apart, by spindle_speed; found {usual:.4g} s"
+            f"index_time: expected pulses about {nominal:.4g} s apart, by spindle_speed; found {usual:.4g} s",
+            code="spindle.index.implausible",
         )
     kept = [0]
     for k in range(1, pulse.size):
@@ -195,19 +204,26 @@ def _by_eccentricity(raw: xr.Dataset, layout: Layout, speed: float, notes: list[
     """Return the angle by the phase of the largest radial reading that occurs once a turn, block by block."""
     radial = np.flatnonzero(layout.radial)
     if not radial.size:
-        raise MethodError("Without index_time and angle, the angle follows from a radial sensor; there is none.")
+        raise MethodError(
+            "Without index_time and angle, the angle follows from a radial sensor; there is none.",
+            code="spindle.angle.unknown",
+        )
     frequency = _frequency(raw, radial, abs(speed) / 60)
     time, phasor, rest = _phasors(raw, radial, frequency)
     known = np.isfinite(phasor).all(axis=1)
     if known.sum() < 2:
-        raise MethodError("The record is too short to follow the eccentricity: expected a time of 20 turns.")
+        raise MethodError(
+            "The record is too short to follow the eccentricity: expected a time of 20 turns.",
+            code="spindle.record.too_short",
+        )
     time, phasor = time[known], phasor[known]
     use = int(np.argmax(np.abs(phasor).mean(axis=0)))
     size, scatter = float(np.abs(phasor[:, use]).mean()), float(np.sqrt(np.mean(rest[known, use])))
     if size < _CLEAR * scatter:
         raise MethodError(
             f"Without index_time and angle, the angle follows from the eccentricity, {1e6 * size:.3g} um, which the "
-            f"other motion, {1e6 * scatter:.3g} um, hides: expected {_CLEAR:g} times as much. Record an index pulse."
+            f"other motion, {1e6 * scatter:.3g} um, hides: expected {_CLEAR:g} times as much. Record an index pulse.",
+            code="spindle.eccentricity.hidden",
         )
     sense = 1 if speed > 0 else -1
     sensor = radial[use]
@@ -239,7 +255,10 @@ def _frequency(raw: xr.Dataset, radial: NDArray[np.intp], nominal: float) -> flo
     f = np.fft.rfftfreq(size, step)
     near = np.flatnonzero((f > 0.8 * nominal) & (f < 1.2 * nominal))
     if not near.size:
-        raise MethodError(f"spindle_speed: no frequency of the readings is near the {nominal:.4g} turns in a second")
+        raise MethodError(
+            f"spindle_speed: no frequency of the readings is near the {nominal:.4g} turns in a second",
+            code="spindle.speed.implausible",
+        )
     return float(f[near[np.argmax(power[near])]])
 
 

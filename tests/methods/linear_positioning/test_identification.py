@@ -62,7 +62,7 @@ def test_a_warm_axis_is_corrected_to_20_degrees(raw_of, identify):
     np.testing.assert_allclose(errors["EX"], cold["EX"], atol=1e-12)
     assert "20 degC" in errors.attrs["reference"]
     assert "temperature of the test" in cold.attrs["reference"]
-    u = errors.em.budget().sel(group="expansion", dof="EX").values
+    u = errors.em.budget().sel(group="scales", dof="EX").values
     # 0.6e-6 1/K at 2 K, and 0.2 K at 11.5e-6 1/K, over the distance from the zero
     np.testing.assert_allclose(u, np.hypot(1.2e-6, 2.3e-6) * P, atol=1e-15)
 

@@ -118,7 +118,8 @@ def _check_slopes(state: State, data: Readings) -> None:
         if abs(k) > _MAX_SLOPE:
             raise MethodError(
                 f"{name}: the inclination error of the calibration is {k:.0%} of the depth; expected a few per cent at "
-                "most. Check that the calibration belongs to this sensor and covers this inclination."
+                "most. Check that the calibration belongs to this sensor and covers this inclination.",
+                code="beam.inclination.too_large",
             )
 
 
@@ -303,7 +304,7 @@ class _Result:
                 value = sensor.calibration.compensate(reading, tilt, sensor.mid_range).value
             except MethodError as error:
                 if not self.settings.extrapolate:
-                    raise MethodError(f"{name}: {error}") from error
+                    raise MethodError(f"{name}: {error}", code=error.code) from error
                 value = sensor.calibration.compensate(reading, tilt, sensor.mid_range, extrapolate=True).value
                 notes.append(
                     f"{name}: extrapolated. Calibration '{sensor.calibration.name}' does not cover {tilt_text(tilt)}, "

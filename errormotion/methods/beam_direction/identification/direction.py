@@ -110,7 +110,8 @@ def solve(beam: Beam, nominal: Array, starts: Sequence[Array] = ()) -> Direction
             f"The direction of the beam {_vector(u)} differs by {_degrees(_angle(u, nominal))} from the nominal "
             f"direction {_vector(nominal)} and has the opposite sign. Check that the nominal direction points from the "
             "sensor to the target, that readings increase with the distance, and whether the stage carries the sensor "
-            "or the target (setting moves)."
+            "or the target (setting moves).",
+            code="beam.direction.opposite",
         )
     other = others[0].state.direction if others else None
     if other is not None and _angle(u, nominal) > SAME_ANGLE * _angle(other, nominal):
@@ -119,7 +120,8 @@ def solve(beam: Beam, nominal: Array, starts: Sequence[Array] = ()) -> Direction
             raise MethodError(
                 f"Two directions fit the planes: {_vector(u)} and {_vector(other)}, {_degrees(_angle(u, nominal))} and "
                 f"{_degrees(_angle(other, nominal))} from the nominal direction, which does not distinguish them. "
-                "State a more accurate nominal direction, or measure a third plane that is tilted about another axis."
+                "State a more accurate nominal direction, or measure a third plane that is tilted about another axis.",
+                code="beam.direction.ambiguous",
             )
         if better:
             best, other = others[0], None
@@ -132,7 +134,8 @@ def _merged(u: Array) -> MethodError:
     return MethodError(
         f"Within its uncertainty, the beam lies in the plane of the normals of the planes, near {_vector(u)}, "
         "where the two possible directions coincide and are not distinguished. Measure a plane that is tilted "
-        "about another axis."
+        "about another axis.",
+        code="beam.direction.ambiguous",
     )
 
 
@@ -165,19 +168,22 @@ def _check_gradients(planes: Planes) -> None:
     if len(gradients) < 2:
         raise MethodError(
             f"Expected two or more planes that are not parallel; found {len(gradients)}. One plane determines only the "
-            "angle between the beam and its normal."
+            "angle between the beam and its normal.",
+            code="beam.planes.too_few",
         )
     size = np.linalg.norm(gradients, axis=1)
     for name, g in zip(planes.names, size, strict=True):
         if g > 50 * MAX_GRADIENT or g < MIN_GRADIENT:
             raise MethodError(
                 f"{name}: the gradient of the reading with the stage position is {g:.3g} m/m; expected 1 to 10. Check "
-                "that readings and stage positions have the same unit, and that the plane is at rest."
+                "that readings and stage positions have the same unit, and that the plane is at rest.",
+                code="beam.gradient.implausible",
             )
         if g > MAX_GRADIENT:
             raise MethodError(
                 f"{name}: grazing incidence at {_degrees(np.arcsin(1 / g))} to the surface; expected at least "
-                f"{_degrees(np.arcsin(1 / MAX_GRADIENT))}. Tilt the plane towards the sensor."
+                f"{_degrees(np.arcsin(1 / MAX_GRADIENT))}. Tilt the plane towards the sensor.",
+                code="beam.plane.grazing",
             )
     normals = gradients / size[:, None]
     noise = float(np.sqrt(np.max(np.linalg.eigvalsh(planes.covariance[:, :3, :3])[:, -1] / size**2)))
@@ -188,7 +194,8 @@ def _check_gradients(planes: Planes) -> None:
         raise MethodError(
             f"The planes are parallel to within {_degrees(spread)}, with a noise of {_degrees(noise)}: they "
             f"determine the angle between the beam and their common normal {_vector(axis)}, but not the rotation of "
-            "the beam about it. Expected planes with different normals, such as a sine gauge turned by 90 deg."
+            "the beam about it. Expected planes with different normals, such as a sine gauge turned by 90 deg.",
+            code="beam.planes.parallel",
         )
 
 

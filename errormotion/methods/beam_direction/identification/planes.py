@@ -95,7 +95,8 @@ def fit_planes(data: Readings, settings: Settings, notes: list[str]) -> Planes:
         if its.sum() < UNKNOWNS:
             raise MethodError(
                 f"{name}: {its.sum()} of {its.size} readings are valid; expected at least {UNKNOWNS}, on strokes along "
-                "three independent directions."
+                "three independent directions.",
+                code="beam.plane.readings_too_few",
             )
     centre = np.stack([positions[its].mean(axis=0) for positions, its in zip(stage, used, strict=True)])
     design = np.concatenate([stage - centre[:, None], np.ones((*distance.shape, 1))], axis=2)
@@ -107,7 +108,8 @@ def fit_planes(data: Readings, settings: Settings, notes: list[str]) -> Planes:
         if its.sum() < max(MIN_USED * before.sum(), UNKNOWNS):
             raise MethodError(
                 f"{name}: {before.sum() - its.sum()} of {before.sum()} readings do not fit a plane. Check that "
-                "positions and readings correspond, and that all readings are on one plane."
+                "positions and readings correspond, and that all readings are on one plane.",
+                code="beam.plane.readings_differ",
             )
     _check_strokes(data.names, design, left, total)
     notes += solved.observed.notes
@@ -168,7 +170,8 @@ def problem_of(
         if n > MAX_CORRELATED:
             raise MethodError(
                 f"{names[0]}: {n} readings with speckle; expected at most {MAX_CORRELATED}. Use fewer readings: those "
-                f"closer than the correlation length ({speckle_length * 1e6:g} um) add little information."
+                f"closer than the correlation length ({speckle_length * 1e6:g} um) add little information.",
+                code="beam.plane.readings_too_many",
             )
         spread = Noise(root=np.stack([correlation_root(each, noise, speckle, speckle_length) for each in stage]))
 
@@ -221,5 +224,7 @@ def _check_strokes(names: tuple[str, ...], design: Array, used: Any, total: floa
         raise MethodError(
             f"{name}: the stage moves along {3 - len(missing)} of three independent directions; along {along} the "
             f"spread (rms) of its positions is {spread * 1e6:.3g} um. Expected strokes along three directions, such as "
-            f"X, Y and Z, with a spread of more than {np.sqrt(least / len(A)) * 1e6:.2g} um, to determine the gradient."
+            f"X, Y and Z, with a spread of more than {np.sqrt(least / len(A)) * 1e6:.2g} um, to determine the "
+            "gradient.",
+            code="beam.plane.strokes",
         )

@@ -84,15 +84,21 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     """
     moves = raw.attrs.get("moves", settings.moves)
     if moves not in ("sensor", "target"):
-        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.")
+        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.", code="raw.moves.form")
     distance = np.array(raw["distance"].transpose("plane", "reading").values, np.float64)
     stage = np.asarray(raw["stage"].transpose("plane", "reading", "direction").values, np.float64)
     names = tuple(f"Plane {i + 1}" for i in range(len(distance)))
     noise, speckle, length = float(raw["distance_noise"]), _scalar(raw, "speckle"), _scalar(raw, "speckle_length")
     if not noise > 0:
-        raise MethodError("distance_noise: expected the standard deviation of one reading at rest, m; found 0.")
+        raise MethodError(
+            "distance_noise: expected the standard deviation of one reading at rest, m; found 0.",
+            code="raw.noise.not_positive",
+        )
     if speckle > 0 and "speckle_length" not in raw:
-        raise MethodError("speckle_length: expected the correlation length of the speckle, m; found none.")
+        raise MethodError(
+            "speckle_length: expected the correlation length of the speckle, m; found none.",
+            code="beam.speckle.missing",
+        )
     low, high = raw["reading_range"].values if "reading_range" in raw else (-np.inf, np.inf)
     within = distance.copy()
     for i, name in enumerate(names):
@@ -138,7 +144,7 @@ def with_receiver_right(normal: ArrayLike, receiver: str | None) -> Array:
         The side is not stated.
     """
     if receiver not in ("left", "right"):
-        raise MethodError(f"receiver: {RECEIVER_NEEDED} Found {receiver!r}.")
+        raise MethodError(f"receiver: {RECEIVER_NEEDED} Found {receiver!r}.", code="beam.receiver.missing")
     t = np.asarray(normal, np.float64)
     return np.asarray((t if receiver == "right" else -t) / np.linalg.norm(t))
 
@@ -156,7 +162,8 @@ def triangulation_normal(raw: xr.Dataset, receiver: str | None = None) -> Array:
     if "triangulation_normal" not in raw:
         raise MethodError(
             "Expected triangulation_normal(direction) in the raw dataset, for the inclination compensation: "
-            f"{NORMAL_NEEDED} Add it, or identify without compensation."
+            f"{NORMAL_NEEDED} Add it, or identify without compensation.",
+            code="beam.triangulation_normal.missing",
         )
     return with_receiver_right(raw["triangulation_normal"].values, raw.attrs.get("receiver", receiver))
 
@@ -183,7 +190,8 @@ def _in_range(
         limits = f" of {low * 1e3:g} to {high * 1e3:g} mm" if np.isfinite(low) else ""
         raise MethodError(
             f"{text}: the strokes leave the sensor's range{limits}. Shorten them, start closer to mid-range, or reduce "
-            "the tilt of the plane."
+            "the tilt of the plane.",
+            code="beam.strokes.outside_range",
         )
     notes.append(f"{text}; the others are used.")
     return np.where(out, np.nan, distance)
@@ -205,5 +213,6 @@ def _check_order(name: str, stage: Array) -> None:
         raise MethodError(
             f"{name}: at reading {rows[moving[at]] + 2} the stage moves back by {size[at] * 1e6:.4g} um along a "
             "stroke; expected strokes in one direction. Check that positions and readings correspond, and check the "
-            "stage for backlash. For positions in any order, set ordered = false."
+            "stage for backlash. For positions in any order, set ordered = false.",
+            code="beam.strokes.backwards",
         )

@@ -55,7 +55,8 @@ def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
             f"The planes contradict the stated side of the receiver: chi-square of their closure is {closed.chi2:.4g} "
             f"with it and {mirrored:.4g} with the opposite one, with {freedom} degree{'s' if freedom > 1 else ''} "
             f"of freedom; expected less than {limit:.3g}. Check triangulation_normal and receiver on the sensor, and "
-            f"receiver_rotation of the readings from which calibration '{sensor.calibration.name}' was made."
+            f"receiver_rotation of the readings from which calibration '{sensor.calibration.name}' was made.",
+            code="beam.receiver.contradicted",
         )
     turned = float(np.linalg.norm(other.state.direction - u))
     deviation = float(np.sqrt(np.linalg.eigvalsh(found.beam.direction_covariance(closed))[-1]))

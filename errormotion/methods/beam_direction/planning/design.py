@@ -291,7 +291,8 @@ def optimise(limits: Limits, start: Array, *, seed: int = 1) -> Design:
         raise MethodError(
             f"No face of the gauge has an inclination of {np.degrees(limits.max_inclination):.3g} deg or less to the "
             "beam. Expected a nominal direction that points down to the gauge, and a gauge that can be inclined "
-            "towards the beam."
+            "towards the beam.",
+            code="beam.plan.no_face",
         )
     planes, shares = _planes(x[: 2 * number], limits), x[2 * number :]
     order = np.lexsort((planes[:, 0], planes[:, 1]))
@@ -331,10 +332,14 @@ def check_numbers(planes: int, limits: Limits) -> None:
         Fewer than two planes, or fewer readings than `MIN_READINGS` for each stroke.
     """
     if planes < 2:
-        raise MethodError(f"Expected two planes or more, to determine both angles of the beam; found {planes}")
+        raise MethodError(
+            f"Expected two planes or more, to determine both angles of the beam; found {planes}",
+            code="beam.plan.planes_too_few",
+        )
     if limits.readings < (needed := 3 * MIN_READINGS * planes):
         raise MethodError(
-            f"Expected {needed} readings or more for {planes} planes with three strokes each; found {limits.readings}"
+            f"Expected {needed} readings or more for {planes} planes with three strokes each; found {limits.readings}",
+            code="beam.plan.readings_too_few",
         )
 
 

@@ -217,7 +217,7 @@ class RemainingError:
 def _remaining(settings: Settings) -> RemainingError | None:
     """Return the remaining error with the calibration of the settings; None without calibration."""
     if settings.compensation is not None and settings.layout.triangulation_normal is None:
-        raise MethodError(f"layout.triangulation_normal: {NORMAL_NEEDED}")
+        raise MethodError(f"layout.triangulation_normal: {NORMAL_NEEDED}", code="beam.triangulation_normal.missing")
     raw = expected(settings)
     sensor = Sensor.of(raw, settings)
     return RemainingError(sensor, raw["nominal_direction"].values, settings.extrapolate) if sensor else None

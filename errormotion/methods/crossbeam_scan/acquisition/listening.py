@@ -29,6 +29,8 @@ BLOCK_LINES = 64
 class BrokenPassError(InstrumentError):
     """The stream failed in a pass; the lines before the failure have been delivered."""
 
+    code = "scan.pass.broken"
+
     def __init__(self, reason: str, position: float) -> None:
         self.reason, self.position = reason, position
         super().__init__(reason)

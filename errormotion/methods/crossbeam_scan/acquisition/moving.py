@@ -131,7 +131,8 @@ class Controlled:
             if self.now() > self._deadline:
                 raise InstrumentError(
                     "The control still runs a program long after its planned end. Check whether it has stopped and "
-                    "whether the feed override is reduced; let the program finish and resume the run."
+                    "whether the feed override is reduced; let the program finish and resume the run.",
+                    code="scan.program.not_ended",
                 )
             self._elapse(POLL_INTERVAL)
 

@@ -88,7 +88,8 @@ def require_streaming(profiler: Any) -> None:
     if hasattr(profiler, "scans"):
         raise MethodError(
             "The scans of a pocket are not read from files: expected a line profiler that streams. A raw dataset of "
-            "the variant 'profiler pose' can be identified directly."
+            "the variant 'profiler pose' can be identified directly.",
+            code="scan.pocket.from_files",
         )
 
 
@@ -122,10 +123,11 @@ def _scan(
             if attempt == FAILURE_LIMIT:
                 raise InstrumentError(
                     f"{program.name} failed {FAILURE_LIMIT} times. The last line of the last attempt was at "
-                    f"{error.position:g} m (nan: no line was received): {error.reason}"
+                    f"{error.position:g} m (nan: no line was received): {error.reason}",
+                    code="scan.program.failed",
                 ) from error
             reopen(profiler)
-    raise InstrumentError(f"{program.name} was not run")
+    raise InstrumentError(f"{program.name} was not run", code="scan.program.not_run")
 
 
 def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> Iterator[Lines]:
@@ -146,7 +148,8 @@ def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array,
     if not parts:
         raise MethodError(
             f"No line was received over the pocket at {settings.pocket_position:g} m: check pocket_position, "
-            f"encoder_pitch ({settings.encoder_pitch:g} m a count) and encoder_zero ({settings.encoder_zero:g} m)."
+            f"encoder_pitch ({settings.encoder_pitch:g} m a count) and encoder_zero ({settings.encoder_zero:g} m).",
+            code="scan.pocket.no_line",
         )
     y = np.concatenate([part.position for part in parts]) - settings.pocket_position
     heights = np.concatenate([part.heights for part in parts])
@@ -160,7 +163,8 @@ def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array,
         raise MethodError(
             f"Expected {count} lines {settings.line_pitch * 1e6:g} um apart over the pocket; found "
             f"{np.unique(index[inside]).size} different positions among {y.size} lines. Check line_pitch against the "
-            "profiler's trigger, and encoder_pitch."
+            "profiler's trigger, and encoder_pitch.",
+            code="scan.pocket.lines_missing",
         )
     gridded: Heights = np.full((count, heights.shape[1]), np.nan, dtype=np.float32)
     gridded[index[inside]] = heights[inside]

@@ -115,7 +115,8 @@ class Program:
             raise MethodError(
                 f"{self.name} would move from Y{_mm(low)} to Y{_mm(high)}, but the axis travels from {_mm(travel[0])} "
                 f"to {_mm(travel[1])} mm (setting 'travel'): move the artefacts, or reduce 'margin' or "
-                "'warm_up_travel'. No program was written."
+                "'warm_up_travel'. No program was written.",
+                code="scan.program.outside_travel",
             )
 
 
@@ -134,7 +135,8 @@ def pass_ends(settings: Settings) -> tuple[float, float]:
     if not settings.positions:
         raise MethodError(
             "The scans need the positions of the artefacts: set 'positions' to the positions of the axis at which the "
-            "profiler is over the middle of each artefact, such as ['350 mm', '550 mm']."
+            "profiler is over the middle of each artefact, such as ['350 mm', '550 mm'].",
+            code="scan.positions.missing",
         )
     beyond = settings.scan_length / 2 + settings.margin
     return settings.positions[0] - beyond, settings.positions[-1] + beyond
@@ -169,7 +171,8 @@ def warm_up_piece(settings: Settings, number: int, seconds: float, start: float)
     feed = settings.warm_up_feed
     if high - low < _SHORTEST:
         raise MethodError(
-            f"warm_up_travel: expected two different ends, so that the axis moves; found Y{_mm(low)} and Y{_mm(high)}."
+            f"warm_up_travel: expected two different ends, so that the axis moves; found Y{_mm(low)} and Y{_mm(high)}.",
+            code="scan.warm_up.travel",
         )
     steps: list[Move] = [Move(low, feed)]
     remaining = seconds - abs(start - low) / feed

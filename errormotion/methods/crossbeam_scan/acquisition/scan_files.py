@@ -45,7 +45,8 @@ def record_files(
         raise MethodError(
             f"Expected {plan.cycles * artefacts} files, ordered by pass and artefact: {plan.cycles} passes "
             f"({plan.cold} cold and {plan.cycles - plan.cold} warm) over {artefacts} artefacts; found {len(names)}. "
-            "See the settings 'positions', 'warm_up' and 'cold_repeats'."
+            "See the settings 'positions', 'warm_up' and 'cold_repeats'.",
+            code="scan.files.count",
         )
     before = 0 if done is None else int(done.sizes["line"])
     zero = np.zeros(artefacts)
@@ -59,7 +60,8 @@ def record_files(
         if scan.x.shape != first_x.shape or not np.allclose(scan.x, first_x, atol=1e-7, rtol=0):
             raise MethodError(
                 f"{scan.path} has {scan.x.size} points from {scan.x[0]:.6f} to {scan.x[-1]:.6f} m on each line; "
-                f"expected {first_x.size} from {first_x[0]:.6f} to {first_x[-1]:.6f} m as in the first file."
+                f"expected {first_x.size} from {first_x[0]:.6f} to {first_x[-1]:.6f} m as in the first file.",
+                code="scan.files.points",
             )
         if cycle == 0:
             zero[artefact] = (y[0] + y[-1]) / 2

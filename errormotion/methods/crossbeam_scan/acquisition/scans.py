@@ -130,7 +130,8 @@ def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]
     if stated is None:
         raise MethodError(
             "The scans need the profiler's pose in the tool frame. Run a test with procedure = 'profiler_pose' before "
-            "this one and refer to it by inputs = { pose = 'its name' }; or state the setting 'profiler_pose'."
+            "this one and refer to it by inputs = { pose = 'its name' }; or state the setting 'profiler_pose'.",
+            code="scan.pose.missing",
         )
     return np.asarray(stated_pose(stated).as_matrix()), stated_covariance(stated)
 
@@ -210,7 +211,8 @@ class _Campaign:
                 yield from self._interrupted(error)
                 if broken == FAILURE_LIMIT:
                     raise InstrumentError(
-                        f"{FAILURE_LIMIT} successive passes failed, the last one is number {self.next}: {error.reason}"
+                        f"{FAILURE_LIMIT} successive passes failed, the last one is number {self.next}: {error.reason}",
+                        code="scan.passes.failed",
                     ) from error
                 reopen(self.profiler)
                 if self.next < self.plan.cold:
@@ -265,7 +267,7 @@ class _Campaign:
                         yield self.pending.chunk()
         except BrokenPassError:
             if received and not kept:
-                raise MethodError(self._missed(received, *reach)) from None
+                raise MethodError(self._missed(received, *reach), code="scan.pass.missed") from None
             raise
         if self.pending.lines:
             yield self.pending.chunk()
@@ -326,7 +328,8 @@ def _age(done: xr.Dataset) -> float:
     except ValueError as error:
         raise MethodError(
             f"The interrupted record does not state when it started ({error}; expected UTC such as "
-            "2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run."
+            "2025-03-01T08:00:00+00:00) and cannot be resumed. Start a new run.",
+            code="run.start.missing",
         ) from error
 
 

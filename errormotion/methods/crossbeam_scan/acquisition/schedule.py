@@ -124,7 +124,8 @@ def schedule(settings: Settings) -> Schedule:
         if seconds <= 0:
             raise MethodError(
                 f"warm_up: the pass at {due / MINUTE:g} min can start at {(free + PROGRAM_INTERVAL) / MINUTE:.1f} min "
-                f"at the earliest: a measuring pass takes {first / MINUTE:.1f} min. Expected times further apart."
+                f"at the earliest: a measuring pass takes {first / MINUTE:.1f} min. Expected times further apart.",
+                code="scan.warm_up.too_short",
             )
         piece = warm_up_piece(settings, number, seconds, high)
         programs[piece.name] = piece

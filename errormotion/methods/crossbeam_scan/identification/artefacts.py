@@ -289,7 +289,8 @@ def moved_artefacts(
     if t.shape != E.shape[:1] or y.shape != E.shape[1:2] or not (np.diff(t) > 0).all():
         raise MethodError(
             f"Expected increasing times ({E.shape[0]},) and positions ({E.shape[1]},) for errors of shape {E.shape}; "
-            f"found {t.shape} and {y.shape}."
+            f"found {t.shape} and {y.shape}.",
+            code="scan.consistency.shape",
         )
     cold = np.broadcast_to(np.asarray(cold_covariance, dtype=float), C.shape)
     known = np.asarray(np.isfinite(E).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1)), dtype=bool)
@@ -422,11 +423,20 @@ def _checked(
     """Return twists and covariance as arrays; raise MethodError where their shapes do not match."""
     E, C = np.asarray(twist, dtype=float), np.asarray(covariance, dtype=float)
     if E.ndim != 3 or E.shape[-1] != 6 or C.shape != (*E.shape, 6):
-        raise MethodError(f"Expected twists ({dims}, 6) and covariance ({dims}, 6, 6); found {E.shape} and {C.shape}.")
+        raise MethodError(
+            f"Expected twists ({dims}, 6) and covariance ({dims}, 6, 6); found {E.shape} and {C.shape}.",
+            code="scan.consistency.shape",
+        )
     if len(repeatability) != 2 or not all(0 <= sigma < np.inf for sigma in repeatability):
-        raise MethodError(f"repeatability: expected two standard deviations, m and rad; found {tuple(repeatability)}.")
+        raise MethodError(
+            f"repeatability: expected two standard deviations, m and rad; found {tuple(repeatability)}.",
+            code="scan.consistency.repeatability",
+        )
     if not 0 < false_alarm < 1:
-        raise MethodError(f"false_alarm: expected a probability between 0 and 1; found {false_alarm}.")
+        raise MethodError(
+            f"false_alarm: expected a probability between 0 and 1; found {false_alarm}.",
+            code="scan.consistency.false_alarm",
+        )
     return E, C
 
 

@@ -158,6 +158,9 @@ def root(covariance: ArrayLike | None) -> Array:
         return np.zeros((6, 6))
     C = np.asarray(covariance, dtype=float)
     if C.shape != (6, 6) or not np.allclose(C, C.T, rtol=1e-6, atol=0) or np.any(np.diag(C) < 0):
-        raise MethodError(f"Expected a symmetric covariance (6, 6) of the profiler's pose; found shape {C.shape}.")
+        raise MethodError(
+            f"Expected a symmetric covariance (6, 6) of the profiler's pose; found shape {C.shape}.",
+            code="scan.pose.covariance",
+        )
     size, vectors = np.linalg.eigh(C / np.outer(POSE_UNIT, POSE_UNIT))
     return np.asarray((vectors * np.sqrt(np.maximum(size, 0.0)) * POSE_UNIT[:, None]).T[::-1])

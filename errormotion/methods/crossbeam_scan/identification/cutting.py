@@ -87,7 +87,8 @@ class Scans:
         if "record" not in raw and not {"height", "y"} <= set(raw.variables):
             raise MethodError(
                 "Expected scans: a raw dataset of crossbeam_scan with record(line, point), or with height and y; found "
-                f"{', '.join(map(str, raw.data_vars))}."
+                f"{', '.join(map(str, raw.data_vars))}.",
+                code="scan.record.missing",
             )
         self._raw = raw
         self.notes: list[str] = []
@@ -115,7 +116,7 @@ class Scans:
         height = part["height"].transpose("profile", "point").values
         known = np.isfinite(y)
         if not known.any() or not np.isfinite(height).any():
-            raise MethodError("there is no scan: all values are NaN")
+            raise MethodError("there is no scan: all values are NaN", code="scan.no_values")
         y, height = y[known], height[known]
         if y[0] > y[-1]:
             y, height = y[::-1], height[::-1]
@@ -168,14 +169,15 @@ class _Record:
         )
         raise MethodError(
             f"Expected lines at the artefacts ({where} m), tens of micrometres apart; found {found}. Check "
-            f"encoder_pitch ({pitch:g} m a count: metres, not millimetres) and encoder_zero."
+            f"encoder_pitch ({pitch:g} m a count: metres, not millimetres) and encoder_zero.",
+            code="scan.lines.elsewhere",
         )
 
     def scan(self, cycle: int, artefact: int) -> tuple[NDArray[np.float32], Array, float]:
         middle = self._positions[artefact]
         attempts = list(self._attempts(cycle, middle))
         if not attempts:
-            raise MethodError(self._missing(cycle, "the scan has no lines"))
+            raise MethodError(self._missing(cycle, "the scan has no lines"), code="scan.lines.missing")
         rows, y = max(reversed(attempts), key=lambda attempt: float(np.ptp(attempt[1])))
         at = f"Pass {cycle} at {middle:g} m"
         order, y = self._ordered(y, at)
@@ -224,23 +226,27 @@ class _Record:
 
     def _check_complete(self, y: Array, cycle: int) -> None:
         if y.size < MIN_LINES:
-            raise MethodError(self._missing(cycle, f"the scan has {y.size} lines only"))
+            raise MethodError(self._missing(cycle, f"the scan has {y.size} lines only"), code="scan.lines.missing")
         pitch = float(np.median(np.diff(y)))
         low, high = -self._length / 2, self._length / 2
         missing = max(y[0] - low, high - y[-1]) - pitch
         if missing > END_SHARE * self._length:
             part = float(np.ptp(y)) / self._length
             raise MethodError(
-                self._missing(cycle, f"the scan is {part:.0%} complete, from {y[0]:+.4f} to {y[-1]:+.4f} m")
+                self._missing(cycle, f"the scan is {part:.0%} complete, from {y[0]:+.4f} to {y[-1]:+.4f} m"),
+                code="scan.lines.missing",
             )
         gap = int(np.argmax(np.diff(y)))
         if y[gap + 1] - y[gap] > GAP + pitch:
             raise MethodError(
-                f"lines are lost over {(y[gap + 1] - y[gap]) * 1e3:.2f} mm at {y[gap]:+.4f} m from the artefact"
+                f"lines are lost over {(y[gap + 1] - y[gap]) * 1e3:.2f} mm at {y[gap]:+.4f} m from the artefact",
+                code="scan.lines.missing",
             )
         lost = 1 - y.size * pitch / (np.ptp(y) + pitch)
         if lost > LOST_SHARE:
-            raise MethodError(f"{lost:.0%} of its lines are lost; expected at most {LOST_SHARE:.0%}")
+            raise MethodError(
+                f"{lost:.0%} of its lines are lost; expected at most {LOST_SHARE:.0%}", code="scan.lines.missing"
+            )
 
     def _missing(self, cycle: int, what: str) -> str:
         """Return why a scan is missing or incomplete."""
@@ -288,5 +294,6 @@ def _refuse_disorder(y: Array) -> None:
         raise MethodError(
             f"expected y to increase from line to line; {behind} of {y.size} lines are at or before the position of "
             f"the previous line, the first one at {y[k + 1]:.6f} m after {y[k]:.6f} m. Check the encoder signal for "
-            "noise, and whether the axis stopped or reversed."
+            "noise, and whether the axis stopped or reversed.",
+            code="scan.lines.backwards",
         )

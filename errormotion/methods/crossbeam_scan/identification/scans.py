@@ -168,7 +168,10 @@ def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
     """
     positions = np.asarray(raw["position"].values, dtype=float)
     if np.any(np.diff(positions) <= 0):
-        raise MethodError(f"position: expected increasing positions of the artefacts; found {positions.tolist()} m")
+        raise MethodError(
+            f"position: expected increasing positions of the artefacts; found {positions.tolist()} m",
+            code="scan.positions.not_increasing",
+        )
     if measured := "displacement" not in raw:
         scans = Scans(raw)
         cycles, corrected = scans.cycles, scans.notes
@@ -180,12 +183,16 @@ def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
         found = Registrations.stated(raw)
     warm = [c for c in range(cycles) if c not in cold]
     if not warm:
-        raise MethodError(f"Expected warm scans after the cold ones; found {cycles} cycles, all of them cold")
+        raise MethodError(
+            f"Expected warm scans after the cold ones; found {cycles} cycles, all of them cold",
+            code="scan.no_warm_scans",
+        )
     if not np.isfinite(found.twist[warm]).any():
         reasons = sorted({reason for reason in found.reason.ravel() if reason})
         raise MethodError(
             f"None of {len(warm) * positions.size} warm scans could be registered onto its cold scan: "
-            + "; ".join(reasons[:3])
+            + "; ".join(reasons[:3]),
+            code="registration.none",
         )
     rows = [cold[0], *warm]
     time = cycle_times(found.time, rows, _planned(raw, cycles))
@@ -235,7 +242,10 @@ def rig_of(raw: xr.Dataset) -> Rig:
     """Return the pose and the lever that a raw dataset states."""
     matrix = np.asarray(raw["profiler_pose"].transpose("row", "column").values, dtype=float)
     if not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(matrix[:3, :3]) < 0:
-        raise MethodError("profiler_pose: expected a rotation in its first three rows and columns; found none")
+        raise MethodError(
+            "profiler_pose: expected a rotation in its first three rows and columns; found none",
+            code="scan.pose.no_rotation",
+        )
 
     def known(name: str) -> Array | None:
         return np.asarray(raw[name].values, dtype=float) if name in raw else None
@@ -266,7 +276,10 @@ def cycle_times(scan_time: Array, rows: list[int], planned: Array | None = None)
     after = time[last] + pace * np.maximum(plan - plan[last], 0.0)
     time = np.where(np.isfinite(time), time, np.interp(plan, plan[known], time[known]) + after - time[last])
     if np.any(np.diff(time) <= 0):
-        raise MethodError(f"time: expected increasing times of the cycles; found {np.round(time, 1).tolist()} s")
+        raise MethodError(
+            f"time: expected increasing times of the cycles; found {np.round(time, 1).tolist()} s",
+            code="scan.times.not_increasing",
+        )
     return time
 
 

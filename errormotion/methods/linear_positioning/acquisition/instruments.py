@@ -59,7 +59,8 @@ def axis_reader(bench: Bench, settings: Settings) -> Reader:
         if settings.freedoms != (along,):
             raise MethodError(
                 f"freedoms: a laser tracker in line with {settings.axis} reads only {along}; found "
-                f"{', '.join(settings.freedoms)}."
+                f"{', '.join(settings.freedoms)}.",
+                code="position.freedoms.not_read",
             )
         if hasattr(tracker, "measure"):
             return TrackerReader(tracker, settings.average)
@@ -85,7 +86,8 @@ def diagonal_reader(bench: Bench, settings: Settings, channel: str, name: str) -
 def _missing() -> MethodError:
     return MethodError(
         "Expected an instrument of kind 'interferometer', or a 'laser_tracker' that measures one target at a time; the "
-        "bench has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
+        "bench has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'.",
+        code="position.instrument.missing",
     )
 
 
@@ -106,7 +108,8 @@ class InterferometerReader:
             if channels.get(name) != unit:
                 known = ", ".join(f"{each} ({kind})" for each, kind in channels.items())
                 raise MethodError(
-                    f"{key}: expected a channel in {unit} of the interferometer, which has {known}; found '{text}'."
+                    f"{key}: expected a channel in {unit} of the interferometer, which has {known}; found '{text}'.",
+                    code="position.channel.unknown",
                 )
             self._names.append(name)
             self._signs.append(-1.0 if text.startswith("-") else 1.0)
@@ -147,7 +150,8 @@ class TrackerReader:
         measured = self._measured()
         if measured is None:
             raise MethodError(
-                "The tracker measures no distance at the first target. Check that it has acquired its reflector."
+                "The tracker measures no distance at the first target. Check that it has acquired its reflector.",
+                code="position.tracker.no_distance",
             )
         self._zero, self._path = measured
         self.lost = False

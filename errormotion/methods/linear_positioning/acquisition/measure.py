@@ -73,7 +73,8 @@ class Motion:
         if not hasattr(self.control, "move_to"):
             raise MethodError(
                 "Expected an instrument of kind 'controller' that can move the axis to a position (move_to); the bench "
-                "has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'."
+                "has none. Run the NC program, write the readings to a table, and use 'errormotion identify FILE'.",
+                code="bench.controller.no_moves",
             )
 
         self.origin: float | None = None
@@ -111,7 +112,8 @@ class Motion:
                 raise MethodError(
                     f"{'XYZ'[k]} {position[k] * 1e3:.3f} mm: the axis is {off[k] * 1e3:.4g} mm from this position "
                     f"after {self.settings.timeout:g} s. Check for feed hold, and that the position is within the "
-                    "travel."
+                    "travel.",
+                    code="machine.position.not_reached",
                 )
             time.sleep(_POLL_INTERVAL)
 
@@ -181,13 +183,15 @@ class AxisMeasurement(Motion):
         if not self.bench.has_kind("thermometer"):
             raise MethodError(
                 f"machine.sensors, workpiece.sensors: expected an instrument of kind 'thermometer' on the bench for "
-                f"{', '.join(self.sensors)}; found none. Add it, or leave the sensors out."
+                f"{', '.join(self.sensors)}; found none. Add it, or leave the sensors out.",
+                code="bench.thermometer.missing",
             )
         thermometer = self.bench.of_kind("thermometer")
         if missing := [name for name in self.sensors if name not in thermometer.channels]:
             raise MethodError(
                 f"machine.sensors, workpiece.sensors: expected channels of the thermometer, "
-                f"{', '.join(thermometer.channels)}; found {', '.join(missing)}."
+                f"{', '.join(thermometer.channels)}; found {', '.join(missing)}.",
+                code="bench.thermometer.channels",
             )
         return thermometer
 

@@ -35,7 +35,7 @@ def measure_moving(bench: Bench, settings: Settings, done: xr.Dataset | None) ->
         An interrupted test, a broken beam in the cold state, and as of `measure_axis`.
     """
     if done is not None:
-        raise MethodError(NOT_CONTINUED)
+        raise MethodError(NOT_CONTINUED, code="run.not_continuable")
     low, high = ends(settings)
     axis = AxisMeasurement(bench, settings, zero=low)
     axis.move(low)

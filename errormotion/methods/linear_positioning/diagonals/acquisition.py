@@ -87,7 +87,9 @@ def _measure(motion: Motion, line: Line, stops: Array, reader: Reader) -> xr.Dat
             x[approach.run, approach.direction, approach.target] = float(reader.read(distance)[0]) - distance
         motion.wait(settings.dwell - settings.settle)
     if not np.isfinite(x).any():
-        raise MethodError(f"Diagonal {line.name}: no reading. Check that the beam is not broken.")
+        raise MethodError(
+            f"Diagonal {line.name}: no reading. Check that the beam is not broken.", code="diagonal.no_reading"
+        )
     variables: dict[str, Any] = {
         "diagonal_deviation": (STOPS, x[None], _M),
         "stop_point": (("diagonal", "stop", "direction"), np.array([[line.point(float(s)) for s in stops]]), _M),

@@ -51,7 +51,10 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     """
     names = labels(raw, "diagonal")
     if not names or len(set(names)) < len(names):
-        raise MethodError(f"diagonal: expected a different name for each diagonal; found {', '.join(names) or 'none'}")
+        raise MethodError(
+            f"diagonal: expected a different name for each diagonal; found {', '.join(names) or 'none'}",
+            code="diagonal.names",
+        )
     notes: list[str] = []
     approach = approaches_of(raw)
     points = _points(raw)
@@ -60,7 +63,7 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     x = raw["diagonal_deviation"].transpose("diagonal", "approach", "run", "stop").values.astype(float)
     for name, values in zip(names, x, strict=True):
         if not np.isfinite(values).any():
-            raise MethodError(f"Diagonal {name}: expected readings; found none")
+            raise MethodError(f"Diagonal {name}: expected readings; found none", code="diagonal.no_reading")
         if count := int(np.isnan(values).sum()):
             notes.append(f"Diagonal {name}: {count} of {values.size} readings are missing; the others are evaluated.")
     lines = np.ones(len(names), dtype=bool)
@@ -141,12 +144,16 @@ def _points(raw: xr.Dataset) -> Array:
 def _unit(name: str, points: Array) -> Array:
     """Return the direction of a diagonal with stops (stop, 3); MethodError if they are not on a line, in order."""
     if len(points) < MIN_TARGETS:
-        raise MethodError(f"stop_point of {name}: expected {MIN_TARGETS} positions or more; found {len(points)}")
+        raise MethodError(
+            f"stop_point of {name}: expected {MIN_TARGETS} positions or more; found {len(points)}",
+            code="diagonal.stops.too_few",
+        )
     span = points[-1] - points[0]
     length = float(np.linalg.norm(span))
     if not (np.isfinite(points).all() and length > 0.0):
         raise MethodError(
-            f"stop_point of {name}: expected positions on a line; found NaN, or a last stop that is the first one"
+            f"stop_point of {name}: expected positions on a line; found NaN, or a last stop that is the first one",
+            code="diagonal.stops.no_line",
         )
     unit = span / length
     distance = (points - points[0]) @ unit
@@ -154,7 +161,8 @@ def _unit(name: str, points: Array) -> Array:
     if off > MAX_OFF_LINE or (np.diff(distance) <= 0.0).any():
         raise MethodError(
             f"stop_point of {name}: expected positions on a line, in order; found one {off * 1e6:.1f} um off the line, "
-            "or out of order"
+            "or out of order",
+            code="diagonal.stops.no_line",
         )
     return np.asarray(unit)
 

@@ -63,7 +63,9 @@ class Line:
 def diagonals_of(settings: Settings) -> Diagonals:
     """Return the settings of the diagonals; MethodError if there are none."""
     if settings.diagonals is None:
-        raise MethodError("diagonals: expected the settings of the diagonals; found none")
+        raise MethodError(
+            "diagonals: expected the settings of the diagonals; found none", code="diagonal.settings.missing"
+        )
     return settings.diagonals
 
 

@@ -76,7 +76,8 @@ def sides_of(
             raise MethodError(
                 f"Expansion of the {name}: expected its coefficient ({name}_expansion in the data, {name}.expansion in "
                 f"the settings) and its temperature ({name}.temperature, or the names of its sensors in "
-                f"{name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}."
+                f"{name}.sensors); found {'no coefficient' if alpha is None else 'no temperature'}.",
+                code="expansion.data.incomplete",
             )
         notes += _assumptions(raw, name, side, settings)
         found.append(Side(name, sign, alpha, u_alpha, excess, u_T))
@@ -108,7 +109,7 @@ def _scalar(raw: xr.Dataset, name: str, default: float | None) -> float | None:
         return default
     value = float(raw[name])
     if not np.isfinite(value):
-        raise MethodError(f"{name}: expected a number; found NaN. Omit it if it is unknown")
+        raise MethodError(f"{name}: expected a number; found NaN. Omit it if it is unknown", code="raw.value.unknown")
     return value
 
 
@@ -119,7 +120,9 @@ def _excess(
     names = side.sensors or ((name,) if name in temperature else ())
     if missing := [sensor for sensor in names if sensor not in temperature]:
         known = ", ".join(temperature) or "none"
-        raise MethodError(f"{name}.sensors: expected names of {known}; found {', '.join(missing)}")
+        raise MethodError(
+            f"{name}.sensors: expected names of {known}; found {', '.join(missing)}", code="bench.thermometer.channels"
+        )
     if names:
         mean = np.stack([_filled(temperature[sensor], sensor) for sensor in names]).mean(axis=0)
         return np.asarray(mean - reference)
@@ -129,5 +132,8 @@ def _excess(
 def _filled(temperature: Array, sensor: str) -> Array:
     """Return the temperatures of a sensor, missing ones replaced by their mean."""
     if not np.isfinite(temperature).any():
-        raise MethodError(f"temperature: expected values of sensor {sensor}; found only NaN. Omit the sensor")
+        raise MethodError(
+            f"temperature: expected values of sensor {sensor}; found only NaN. Omit the sensor",
+            code="expansion.temperature.no_values",
+        )
     return np.where(np.isfinite(temperature), temperature, np.nanmean(temperature))

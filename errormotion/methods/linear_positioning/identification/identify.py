@@ -106,7 +106,10 @@ def _ends(position: Array, known: Array, straight: Any) -> Datum:
     for k in np.flatnonzero(straight):
         there = np.flatnonzero(known[:, k] == 0)
         if there.size < 2:
-            raise MethodError("deviation: expected means of a straightness at two targets or more; found fewer")
+            raise MethodError(
+                "deviation: expected means of a straightness at two targets or more; found fewer",
+                code="position.straightness.too_few",
+            )
         ends = there[[0, -1]]
         t = (position - position[ends[0]]) / (position[ends[1]] - position[ends[0]])
         for values in (1.0 - t, t):

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 TREND = "trend over the test"
 DRIFT, ALIGNMENT, LENGTH, GAIN, EXPANSION, END, NOISE = (
-    *("drift from run to run", "alignment", "scale of the lengths", "gain of the instrument", "expansion"),
+    *("drift from run to run", "alignment", "scale of the lengths", "gain of the instrument", "scales"),
     *("ends of the reference line", "readings"),
 )
 """Groups of sources."""
@@ -94,7 +94,7 @@ def spreads_of(readings: Readings, settings: Settings, what: str = "") -> list[S
         try:
             spreads.append(scatter(x, z, kind=settings.scatter, drift=drift, stated=stated))
         except MethodError as error:
-            raise MethodError(f"{what}{readings.names[k]}: {error}") from None
+            raise MethodError(f"{what}{readings.names[k]}: {error}", code=error.code) from None
     return spreads
 
 
@@ -152,7 +152,8 @@ def known_of(readings: Readings) -> Array:
     known = np.where((seen | ~measured[..., None]).all(axis=1), 0.0, np.nan)
     if np.isnan(known).all():
         raise MethodError(
-            "deviation: expected a target that was reached in all measured directions; found none. Measure more."
+            "deviation: expected a target that was reached in all measured directions; found none. Measure more.",
+            code="position.target.not_reached",
         )
     return known
 

@@ -138,7 +138,10 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     order = np.argsort(P)
     x = np.asarray(raw["end_deviation"].transpose("cycle", "end", "freedom").values, dtype=float)[:, order]
     if not np.isfinite(x[time <= 0.0]).any(axis=0).all():
-        raise MethodError("end_deviation: expected a reading of each freedom and end in the cold state; found none")
+        raise MethodError(
+            "end_deviation: expected a reading of each freedom and end in the cold state; found none",
+            code="moving_axis.cold.no_readings",
+        )
     if missing := int(np.isnan(x).sum()):
         notes.append(f"{missing} of {x.size} readings are missing.")
     stated = raw["reading_scatter"].values if "reading_scatter" in raw else np.zeros(len(freedoms))
@@ -256,15 +259,26 @@ def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str
 
 def _check(time: Array, moving: Array, P: Array) -> None:
     if not np.isfinite(time).all() or any(second <= first for first, second in pairwise(time)):
-        raise MethodError("reading_time: expected increasing times; found NaN, or a time that does not increase")
+        raise MethodError(
+            "reading_time: expected increasing times; found NaN, or a time that does not increase",
+            code="moving_axis.times.not_increasing",
+        )
     if not np.isfinite(moving).all():
-        raise MethodError("moving: expected 0 or 1 for each cycle; found NaN")
+        raise MethodError("moving: expected 0 or 1 for each cycle; found NaN", code="moving_axis.moving.unknown")
     if not (time <= 0).any():
-        raise MethodError("reading_time: expected a cold state at times of 0 or less; found none")
+        raise MethodError(
+            "reading_time: expected a cold state at times of 0 or less; found none", code="moving_axis.cold.missing"
+        )
     if (time > 0).sum() < MIN_CYCLES:
-        raise MethodError(f"cycle: expected {MIN_CYCLES} cycles or more after the cold state; found {(time > 0).sum()}")
+        raise MethodError(
+            f"cycle: expected {MIN_CYCLES} cycles or more after the cold state; found {(time > 0).sum()}",
+            code="moving_axis.cycles.too_few",
+        )
     if not (np.isfinite(P).all() and np.ptp(P) > 0):
-        raise MethodError("end_position: expected two different positions; found NaN, or one position twice")
+        raise MethodError(
+            "end_position: expected two different positions; found NaN, or one position twice",
+            code="moving_axis.ends.form",
+        )
 
 
 def _noise(values: Array) -> float:
@@ -272,7 +286,10 @@ def _noise(values: Array) -> float:
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
     second = second[np.isfinite(second)]
     if second.size < MIN_DIFFERENCES:
-        raise MethodError("end_deviation: expected more readings in successive cycles; found too few for their noise")
+        raise MethodError(
+            "end_deviation: expected more readings in successive cycles; found too few for their noise",
+            code="moving_axis.readings.too_few",
+        )
     return float(np.sqrt(np.mean(second**2) / 6.0))
 
 

@@ -105,7 +105,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
     _check_positions(position)
     measured = np.asarray(raw["deviation"].transpose("freedom", "approach", "run", "target").values, dtype=float)
     if not np.isfinite(measured).any(axis=(1, 2, 3)).all():
-        raise MethodError("deviation: expected readings of each freedom; found none for one or more of them")
+        raise MethodError(
+            "deviation: expected readings of each freedom; found none for one or more of them",
+            code="position.no_readings",
+        )
     ordered = np.argsort(position)
     zero = zero_of(raw)
     is_along = np.array([name == along for name in freedoms])
@@ -133,7 +136,9 @@ def zero_of(raw: xr.Dataset) -> float:
     """Return the position at which the instrument was set to zero, m; the first target if it is not stated."""
     zero = float(raw["zero_position"]) if "zero_position" in raw else float(raw["target_position"].values[0])
     if not np.isfinite(zero):
-        raise MethodError("zero_position: expected a position; found NaN. Omit it if it is unknown")
+        raise MethodError(
+            "zero_position: expected a position; found NaN. Omit it if it is unknown", code="raw.value.unknown"
+        )
     return zero
 
 
@@ -184,7 +189,10 @@ def per_line(raw: xr.Dataset, name: str, count: int) -> Array:
         return np.zeros(count)
     values = np.asarray(raw[name].values, dtype=float)
     if not np.isfinite(values).all() or (values < 0).any():
-        raise MethodError(f"{name}: expected a value of 0 or more for each freedom; found a negative one, or NaN")
+        raise MethodError(
+            f"{name}: expected a value of 0 or more for each freedom; found a negative one, or NaN",
+            code="raw.value.negative",
+        )
     return values
 
 
@@ -208,7 +216,9 @@ def axis_of(raw: xr.Dataset) -> str:
     by_names = {label[-1:] for label in labels(raw, "freedom")}
     axis = str(raw.attrs.get("axis", by_names.pop() if len(by_names) == 1 else ""))
     if axis not in LINEAR_AXES:
-        raise MethodError(f"attribute axis: expected one of {', '.join(LINEAR_AXES)}; found '{axis}'")
+        raise MethodError(
+            f"attribute axis: expected one of {', '.join(LINEAR_AXES)}; found '{axis}'", code="raw.axis.unknown"
+        )
     return axis
 
 
@@ -223,7 +233,10 @@ def approaches_of(raw: xr.Dataset) -> NDArray[np.intp]:
     """Return the number of each recorded approach, 0 forward and 1 backward; MethodError for other labels."""
     found = labels(raw, "approach")
     if not found or set(found) - set(APPROACHES) or len(set(found)) < len(found):
-        raise MethodError(f"approach: expected the labels forward, backward; found {', '.join(found) or 'none'}")
+        raise MethodError(
+            f"approach: expected the labels forward, backward; found {', '.join(found) or 'none'}",
+            code="position.approach.labels",
+        )
     return np.array([APPROACHES.index(name) for name in found])
 
 
@@ -234,18 +247,26 @@ def freedoms_of(raw: xr.Dataset, axis: str) -> tuple[str, ...]:
     if not names or set(names) - set(by_name) or len(set(names)) < len(names):
         raise MethodError(
             f"freedom: expected different names among {', '.join(by_name)} for axis {axis}; found "
-            f"{', '.join(names) or 'none'}"
+            f"{', '.join(names) or 'none'}",
+            code="position.freedoms.names",
         )
     return tuple(by_name[name] for name in names)
 
 
 def _check_positions(position: Array) -> None:
     if not np.isfinite(position).all():
-        raise MethodError("target_position: expected a position of each target; found NaN")
+        raise MethodError(
+            "target_position: expected a position of each target; found NaN", code="position.targets.unknown"
+        )
     if position.size < MIN_TARGETS:
-        raise MethodError(f"target_position: expected {MIN_TARGETS} targets or more; found {position.size}")
+        raise MethodError(
+            f"target_position: expected {MIN_TARGETS} targets or more; found {position.size}",
+            code="position.targets.too_few",
+        )
     if np.unique(position).size < position.size:
-        raise MethodError("target_position: expected different positions; found one of them twice")
+        raise MethodError(
+            "target_position: expected different positions; found one of them twice", code="position.targets.repeated"
+        )
 
 
 def by_approach(values: Array, approach: NDArray[np.intp], axis: int) -> Array:

@@ -130,12 +130,14 @@ def scatter(
     if runs == 1 and (stated is None or drift is None):
         raise MethodError(
             "The scatter of the readings cannot be estimated from one run. Measure more runs, or state the settings "
-            "uncertainty.scatter and uncertainty.drift."
+            "uncertainty.scatter and uncertainty.drift.",
+            code="position.runs.one",
         )
     if drift is None and runs < MIN_RUNS:
         raise MethodError(
             f"Expected {MIN_RUNS} runs or more, or the drift during one run (setting uncertainty.drift); found "
-            f"{runs} runs: the drift from run to run cannot be estimated."
+            f"{runs} runs: the drift from run to run cannot be estimated.",
+            code="position.runs.too_few",
         )
     if runs == 1 or _equal(x):
         own = np.where(seen, 0.0 if stated is None else stated**2, np.nan)
@@ -196,7 +198,8 @@ def _check_freedom(known: NDArray[np.bool_]) -> None:
     if freedom < MIN_FREEDOM:
         raise MethodError(
             f"Too few readings to estimate their scatter: expected {MIN_FREEDOM} degrees of freedom or more; found "
-            f"{freedom}. Measure more targets or runs."
+            f"{freedom}. Measure more targets or runs.",
+            code="readings.too_few",
         )
 
 
@@ -251,7 +254,9 @@ def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
     try:
         return components(problem, noise=True)
     except FitError as error:
-        raise MethodError(f"deviation: expected readings that determine their scatter; {error}.") from error
+        raise MethodError(
+            f"deviation: expected readings that determine their scatter; {error}.", code=error.code
+        ) from error
 
 
 def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, float, bool, bool]:
@@ -277,7 +282,8 @@ def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, f
         return np.maximum(each, pooled), freedom, False, True
     least = int(np.ceil(2.0 * shape[1] / of_each)) + 1
     raise MethodError(
-        f"Variances by target: expected {least} runs or more at these targets; found {shape[1]}. Use scatter 'pooled'."
+        f"Variances by target: expected {least} runs or more at these targets; found {shape[1]}. Use scatter 'pooled'.",
+        code="position.runs.too_few",
     )
 
 

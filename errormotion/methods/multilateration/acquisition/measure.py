@@ -86,7 +86,8 @@ def measure_stations(
                 if name != setups.names[number]:
                     raise MethodError(
                         f"Expected the next existing set-up at {setups.names[number]}; found {name}. Continue with the "
-                        "sequence with which the run was started, or start a new run."
+                        "sequence with which the run was started, or start a new run.",
+                        code="network.sequence.changed",
                     )
                 if repeats:
                     setups.measure(number)
@@ -123,13 +124,15 @@ class SetUps:
         if not hasattr(self.tracker, "measure"):
             raise MethodError(
                 "Expected a tracker that measures one target at a time (measure); found one that imports "
-                "measurements. Import its table and identify it."
+                "measurements. Import its table and identify it.",
+                code="network.tracker.imports",
             )
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
             raise MethodError(
                 "Expected an instrument of kind 'controller' that can move the machine to a position (move_to); the "
-                "bench has none. Add it, or import a table of the tracker."
+                "bench has none. Add it, or import a table of the tracker.",
+                code="bench.controller.no_moves",
             )
         self.position, self.target, self.order = tour(settings, measuring.returns)
         self.station = np.array(settings.layout.stations, np.float64)
@@ -168,7 +171,8 @@ class SetUps:
             if time.monotonic() > deadline:
                 raise MethodError(
                     f"Target {i + 1}: the machine is {off * 1e3:.4g} mm from this position after "
-                    f"{self.measuring.timeout:g} s. Check for feed hold, and that the position is within the travel."
+                    f"{self.measuring.timeout:g} s. Check for feed hold, and that the position is within the travel.",
+                    code="machine.position.not_reached",
                 )
             time.sleep(_POLL_INTERVAL)
         self.wait(self.measuring.settle)
@@ -254,7 +258,8 @@ class SetUps:
         if self.air_reported and not reported:
             raise MethodError(
                 f"Station {self.names[number]}: expected the state of the air from the tracker, as in earlier "
-                "set-ups; found none. Check its weather station, and resume."
+                "set-ups; found none. Check its weather station, and resume.",
+                code="network.air.missing",
             )
         return self.air_reported
 
@@ -331,5 +336,6 @@ class SetUp:
             names, at = self.setups.names, "({:.2f}, {:.2f}, {:.2f}) m".format(*position)
             raise MethodError(
                 f"Set-up {names[self.number]}: the tracker is near {at}, the position of {names[nearest]}. Move it to "
-                f"the position of {names[self.number]} and resume, or correct layout.stations."
+                f"the position of {names[self.number]} and resume, or correct layout.stations.",
+                code="network.tracker.elsewhere",
             )

@@ -34,7 +34,10 @@ def stations(settings: Settings, measuring: Measuring) -> list[int]:
     count = len(settings.layout.stations)
     sequence = measuring.sequence or tuple(range(1, count + 1))
     if wrong := [k for k in sequence if not 1 <= k <= count]:
-        raise MethodError(f"measuring.sequence: expected numbers of stations from 1 to {count}; found {wrong}")
+        raise MethodError(
+            f"measuring.sequence: expected numbers of stations from 1 to {count}; found {wrong}",
+            code="network.sequence.form",
+        )
     return [k - 1 for k in sequence]
 
 

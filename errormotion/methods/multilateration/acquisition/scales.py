@@ -33,14 +33,16 @@ class Scales:
         if not bench.has_kind("thermometer"):
             raise MethodError(
                 f"measuring.scale_sensors: expected an instrument of kind 'thermometer' on the bench for "
-                f"{', '.join(sensors)}; found none. Add it, or remove the setting."
+                f"{', '.join(sensors)}; found none. Add it, or remove the setting.",
+                code="bench.thermometer.missing",
             )
         self._thermometer: Any = bench.of_kind("thermometer")
         known = [str(name) for name in self._thermometer.channels]
         if missing := [name for name in sensors if name not in known]:
             raise MethodError(
                 f"measuring.scale_sensors: expected sensors of the thermometer, {', '.join(known)}; found "
-                f"{', '.join(dict.fromkeys(missing))}."
+                f"{', '.join(dict.fromkeys(missing))}.",
+                code="bench.thermometer.channels",
             )
 
     def poll(self) -> None:

@@ -128,7 +128,10 @@ def optimise(
 
     u, corners = np.asarray(target, np.float64), np.asarray(boxes, np.float64)
     if len(corners) < MIN_STATIONS:
-        raise MethodError(f"Expected boxes for at least {MIN_STATIONS} stations; found {len(corners)}. Add some.")
+        raise MethodError(
+            f"Expected boxes for at least {MIN_STATIONS} stations; found {len(corners)}. Add some.",
+            code="network.plan.boxes_too_few",
+        )
     low, high = corners[:, 0].ravel(), corners[:, 1].ravel()
     free = np.flatnonzero(high > low)
     fixed = low.copy()
@@ -203,7 +206,8 @@ def optimise(
         raise MethodError(
             f"Expected positions within the boxes with the targets visible from {MIN_STATIONS} stations; found none: "
             f"the best ones lack {_lacking(sight.sees(at(best), u))} readings. Enlarge the boxes, use a reflector with "
-            "a larger acceptance angle, move the obstacles, or add stations."
+            "a larger acceptance angle, move the obstacles, or add stations.",
+            code="network.plan.no_sight",
         )
     return at(best)
 

@@ -122,7 +122,10 @@ def _uncertainty(station: Array, target: Array, sees: NDArray[np.bool_], noise: 
     found = predicted_uncertainty(sees / noise, station, target)
     if found is None:
         bound(target, station, noise=noise, seen=sees)
-        raise MethodError("The distances do not determine stations and targets. Distribute them more widely.")
+        raise MethodError(
+            "The distances do not determine stations and targets. Distribute them more widely.",
+            code="network.undetermined",
+        )
     return found
 
 
@@ -147,7 +150,8 @@ def boxes_of(planning: Planning, stations: Array, targets: Array) -> Array:
         boxes = np.array([(box.low, box.high) for box in planning.boxes], np.float64)
         if len(boxes) not in (1, len(stations)):
             raise MethodError(
-                f"Expected one box for all stations, or one for each of {len(stations)}; found {len(boxes)}."
+                f"Expected one box for all stations, or one for each of {len(stations)}; found {len(boxes)}.",
+                code="network.plan.boxes_count",
             )
         return np.tile(boxes, (len(stations), 1, 1)) if len(boxes) == 1 else boxes
     boxes = np.tile(np.stack([stations.min(axis=0), stations.max(axis=0)]), (len(stations), 1, 1))
@@ -205,7 +209,8 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
     except OSError as error:
         raise MethodError(
-            f"planning.write: {path}: the file cannot be created: {error.strerror or error}. State another name."
+            f"planning.write: {path}: the file cannot be created: {error.strerror or error}. State another name.",
+            code="file.unwritable",
         ) from error
 
 

@@ -86,7 +86,10 @@ def choose(
     refuse_count(choosing.wanted, int(now.fine.sum()), len(own_stations))
     own = now.worth()
     if not now.further.any():
-        raise MethodError("Layout as set: no target is visible from three stations. Check the lines of sight.")
+        raise MethodError(
+            "Layout as set: no target is visible from three stations. Check the lines of sight.",
+            code="network.plan.no_sight",
+        )
     chosen = np.array(now.choose(choosing.wanted, planning.minimise))
     station, before = own_stations, now.worth(chosen)
     best, cost = before, power_mean(before, planning)
@@ -114,7 +117,8 @@ def choose(
     except MethodError as error:
         raise MethodError(
             f"The best {len(chosen)} targets do not determine positions and dead paths of the stations. {error} Choose "
-            "more targets, or add a station."
+            "more targets, or add a station.",
+            code="network.plan.undetermined",
         ) from error
     return Choice(position, chosen, station, own, best, before, sees)
 
@@ -133,7 +137,8 @@ def _expected(settings: Settings, choosing: Choosing, position: Array) -> Expect
     if settings.chain is None:
         raise MethodError(
             "chain: expected the chain of the machine, such as workpiece-X-Y-bed-Z-spindle-tool, to choose targets for "
-            "the errors of the axes; found none. State it, or use planning.targets.uncertainty = 'target'."
+            "the errors of the axes; found none. State it, or use planning.targets.uncertainty = 'target'.",
+            code="network.chain.missing",
         )
     reflector = np.array(settings.layout.reflector, np.float64)
     return Expected.of(

@@ -201,7 +201,8 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
         if length >= settings.interval:
             raise MethodError(
                 f"interval: expected more than the duration of a cycle, {length:.0f} s, so that the machine warms up "
-                f"between the cycles; found {settings.interval:g} s"
+                f"between the cycles; found {settings.interval:g} s",
+                code="probing.interval.too_short",
             )
         steps += part.warm_up
         if part.settle:

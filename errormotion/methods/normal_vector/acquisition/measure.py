@@ -53,7 +53,8 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
     """
     if len(settings.balls) < 3:
         raise MethodError(
-            f"balls: expected the approximate centres of three or more balls; found {len(settings.balls)}."
+            f"balls: expected the approximate centres of three or more balls; found {len(settings.balls)}.",
+            code="probing.balls.too_few",
         )
     probe, control, active, driven = route(bench)
     record = Record(bench, settings, probe, done)
@@ -88,7 +89,8 @@ def route(bench: Bench) -> tuple[Any, Any, bool, bool]:
         raise MethodError(
             f"The touch probe '{probe.info.id}' moves the machine through its controller, and the warm-up needs an "
             "instrument of kind 'controller' that turns the spindle; the bench has none. Add one; or let the machine "
-            "execute a program ('errormotion program') and use a touch probe that reads its printed lines."
+            "execute a program ('errormotion program') and use a touch probe that reads its printed lines.",
+            code="probing.controller.missing",
         )
     return probe, control, active, moves and (active or hasattr(control, "run_program"))
 
@@ -127,7 +129,7 @@ def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.D
     except BaseException as error:
         failure = machine.stop()
         if failure and isinstance(error, InstrumentError):
-            raise type(error)(
+            raise error.restated(
                 f"{error}. Axes and spindle could not be stopped ({failure}): stop them at the machine"
             ) from error
         raise
@@ -184,7 +186,7 @@ def _with_machine_state(error: BaseException, control: Any) -> BaseException:
         except InstrumentError as silent:
             state = f"not answering either ({silent})"
     suffix = f". The machine is {state}" if state else ""
-    extended = type(error)(f"{error}{suffix}. If its program is still running, stop it at the machine")
+    extended = error.restated(f"{error}{suffix}. If its program is still running, stop it at the machine")
     extended.__cause__ = error
     return extended
 

@@ -88,7 +88,9 @@ def _first_up(settings: Settings, tip_radius: float | None = None) -> str:
 
 def _touches(settings: Settings, tip_radius: float | None) -> list[Touch]:
     if not settings.balls:
-        raise MethodError("balls: expected the approximate centres of three or more balls; found none.")
+        raise MethodError(
+            "balls: expected the approximate centres of three or more balls; found none.", code="probing.balls.too_few"
+        )
     return cycle.cycle_touches(settings, settings.tip_radius or tip_radius or cycle.TIP_RADIUS)[0]
 
 

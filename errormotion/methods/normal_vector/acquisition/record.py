@@ -97,7 +97,8 @@ class Record:
             if contact.time <= previous:
                 raise InstrumentError(
                     f"Expected contacts of this cycle; the machine printed one at {contact.time:.3f} s, and the "
-                    f"previous cycle ended at {previous:.3f} s on its clock. Check for repeated lines and the clock."
+                    f"previous cycle ended at {previous:.3f} s on its clock. Check for repeated lines and the clock.",
+                    code="probing.contact.early",
                 )
             self._latest = contact.time if math.isfinite(contact.time) else self._latest
             yield contact
@@ -121,7 +122,8 @@ class Record:
         if insufficient:
             raise InstrumentError(
                 f"The cold cycle has too few good touches of {'; '.join(insufficient)}; expected {MIN_TOUCHES} or "
-                "more of each, since it is the reference of all others. Check the positions of the balls (settings)."
+                "more of each, since it is the reference of all others. Check the positions of the balls (settings).",
+                code="probing.cold.touches_too_few",
             )
 
     def dataset(

@@ -120,7 +120,8 @@ class Warming:
             return
         if not hasattr(self.control, "run_program"):
             raise MethodError(
-                "to_probe, to_warm_up: the controller of this bench executes no programs; remove these settings."
+                "to_probe, to_warm_up: the controller of this bench executes no programs; remove these settings.",
+                code="probing.programs.none",
             )
         run(self.control, "\n".join(["%", "(change of the tool)", *lines, "M30", "%", ""]))
 
@@ -153,12 +154,12 @@ class Warming:
         cause = fault(state) or ("not homed" if state["homed"] is False else "")
         cause = cause or ("" if state["enabled"] else "not enabled")
         if cause:
-            raise InstrumentError(f"The machine is {cause}; nothing was moved")
+            raise InstrumentError(f"The machine is {cause}; nothing was moved", code="machine.not_ready")
         return state
 
     def _check_state(self, when: str) -> None:
         if cause := fault(self.control.state()):
-            raise InstrumentError(f"The machine is {cause}; this occurred {when}")
+            raise InstrumentError(f"The machine is {cause}; this occurred {when}", code="machine.not_ready")
 
     # ------------------------------------------------------------------ after an interruption
 
@@ -189,7 +190,9 @@ def run(control: Any, text: str) -> None:
     while True:
         state = control.state()
         if cause := fault(state):
-            raise InstrumentError(f"The machine is {cause}; this occurred while its program was executed")
+            raise InstrumentError(
+                f"The machine is {cause}; this occurred while its program was executed", code="machine.not_ready"
+            )
         if not state["running"]:
             return
         wait(control, PROGRAM_STATE_INTERVAL)
@@ -215,7 +218,9 @@ def age(done: xr.Dataset) -> float:
     try:
         seconds = record_age(done)
     except ValueError:
-        raise MethodError("The interrupted run does not state its start (attribute start); start a new run.") from None
+        raise MethodError(
+            "The interrupted run does not state its start (attribute start); start a new run.", code="run.start.missing"
+        ) from None
     return float(_ends(done)[-1]) if math.isnan(seconds) else seconds
 
 

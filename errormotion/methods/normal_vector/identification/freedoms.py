@@ -108,14 +108,18 @@ def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
     if len(centres) < MIN_BALLS:
         raise MethodError(
             f"Expected {MIN_BALLS} balls or more on the table, preferably four; found {len(centres)} "
-            f"({', '.join(names) or 'none'}). Set up more balls: they are needed to determine the rotations."
+            f"({', '.join(names) or 'none'}). Set up more balls: they are needed to determine the rotations.",
+            code="probing.balls.too_few",
         )
     motion = Motion(tool_axes, centres.mean(axis=0))
     unknown = undetermined(centres, motion)
     if not unknown:
         return
     if spread(centres) == 0:
-        raise MethodError(f"Balls {', '.join(names)} have the same position; expected positions far apart.")
+        raise MethodError(
+            f"Balls {', '.join(names)} have the same position; expected positions far apart.",
+            code="probing.balls.same_position",
+        )
     away = centres - centres.mean(axis=0)
     size = np.linalg.svd(away, compute_uv=False)
     missing = ", ".join(DOF[k] for k in unknown)
@@ -123,14 +127,16 @@ def check_layout(centres: Array, names: Sequence[str], tool_axes: str) -> None:
         off = size[1] / np.sqrt(len(centres))
         raise MethodError(
             f"Balls {', '.join(names)} lie in one line, within {off * 1e3:.3g} mm: rotations about it are not "
-            f"determined ({missing}). Set up one ball as far from this line as the table allows."
+            f"determined ({missing}). Set up one ball as far from this line as the table allows.",
+            code="probing.balls.on_line",
         )
     axes_of_tool = " and ".join(tool_axes)
     heights = ", ".join(f"{value * 1e3:.4g}" for value in centres[:, "XYZ".index(tool_axes[0])])
     raise MethodError(
         f"If {axes_of_tool} alone carries the tool, rotations are determined only by balls at different positions "
         f"along {axes_of_tool}; these lie at {tool_axes[0]} = {heights} mm, so that {missing} cannot be distinguished "
-        "from displacements. Put some balls on posts, and check tool_axes."
+        "from displacements. Put some balls on posts, and check tool_axes.",
+        code="probing.balls.one_height",
     )
 
 

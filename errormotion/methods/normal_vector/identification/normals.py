@@ -43,7 +43,10 @@ def chosen(names: Sequence[str], stated: Sequence[str] | None) -> list[int]:
     """
     balls = stated or names[:4]
     if missing := [name for name in balls if name not in names]:
-        raise MethodError(f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}")
+        raise MethodError(
+            f"normals_balls: expected names of {', '.join(names)}; found {', '.join(missing)}",
+            code="probing.balls.unknown",
+        )
     return [names.index(name) for name in balls]
 
 

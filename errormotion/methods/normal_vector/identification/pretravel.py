@@ -115,7 +115,8 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
     points = given[np.isfinite(given).all(axis=1)]
     if len(points) < 4 + REDUNDANCY:
         raise FitError(
-            f"Expected at least {4 + REDUNDANCY} touches of the ball; found {len(points)}. 40 or more are recommended"
+            f"Expected at least {4 + REDUNDANCY} touches of the ball; found {len(points)}. 40 or more are recommended",
+            code="probing.touches.too_few",
         )
     contact = settings.ball_radius + settings.tip_radius
     used = np.ones(len(points), dtype=bool)
@@ -181,7 +182,8 @@ def _candidates(points: Array, contact: float, highest: int) -> list[_Fit]:
             candidates.append(fit)
     if not candidates:
         raise FitError(
-            "The touches do not surround the ball sufficiently to determine its centre; touch it from more sides"
+            "The touches do not surround the ball sufficiently to determine its centre; touch it from more sides",
+            code="probing.touches.one_side",
         )
     return candidates
 

@@ -76,7 +76,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
         notes += _flag_notes(flag)
         valid = valid & ~(flag > 0)
     if not valid.any():
-        raise MethodError("Expected touches of balls; found none that is good. Check the function of the probe.")
+        raise MethodError(
+            "Expected touches of balls; found none that is good. Check the function of the probe.",
+            code="probing.no_touches",
+        )
     if settings.reference == "cold":
         _check_cold(start, valid)
     lost = int(valid.size - valid.sum()) // (1 if touched else 3)
@@ -103,7 +106,10 @@ def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
         radius = _array(raw, "ball_radius", "ball") + float(raw["tip_radius"])
     axes = str(raw.attrs.get("tool_axes", settings.tool_axes))
     if axes not in AXES:
-        raise MethodError(f"tool_axes: expected the linear axes that carry the tool, such as XYZ or Z; found '{axes}'")
+        raise MethodError(
+            f"tool_axes: expected the linear axes that carry the tool, such as XYZ or Z; found '{axes}'",
+            code="probing.tool_axes.form",
+        )
     if "tool_axes" not in raw.attrs and "tool_axes" not in settings.model_fields_set:
         notes.append("Assumed, because it is not stated: X, Y and Z carry the tool (tool_axes = XYZ).")
     if "tool_axes" in raw.attrs and axes != settings.tool_axes and "tool_axes" in settings.model_fields_set:
@@ -147,18 +153,21 @@ def check_balls(centre: Array, radius: Array, data: Readings, tolerance: float) 
             if j != i and away[i, j] < min(tolerance, off[i] / 2):
                 raise MethodError(
                     f"Ball {data.names[i]} was found at the position of ball {data.names[j]}: expected the same order "
-                    "of the balls in the program and in ball_nominal."
+                    "of the balls in the program and in ball_nominal.",
+                    code="probing.balls.order",
                 )
             raise MethodError(
                 f"Ball {data.names[i]} was found {off[i] * 1e3:.4g} mm from its nominal position; expected within "
-                f"{tolerance * 1e3:g} mm (ball_tolerance). Check that both are in m and in machine coordinates."
+                f"{tolerance * 1e3:g} mm (ball_tolerance). Check that both are in m and in machine coordinates.",
+                code="probing.ball.elsewhere",
             )
     wrong = np.abs(radius - data.radius) > tolerance
     if wrong.any():
         i = int(np.argmax(wrong))
         raise MethodError(
             f"The touches of ball {data.names[i]} lie on a sphere of radius {radius[i] * 1e3:.4g} mm; expected "
-            f"{data.radius[i] * 1e3:.4g} mm, ball plus tip. Check ball_radius and tip_radius, and their unit (m)."
+            f"{data.radius[i] * 1e3:.4g} mm, ball plus tip. Check ball_radius and tip_radius, and their unit (m).",
+            code="probing.ball.radius",
         )
 
 
@@ -177,11 +186,13 @@ def check_jumps(seen: Observations, names: list[str], tolerance: float) -> None:
     if np.nanmin(other) < tolerance:
         raise MethodError(
             f"{where} was touched at the position of ball {names[int(np.nanargmin(other))]} in the other cycles: "
-            "expected the same order of the balls in all cycles. Check the program and the record for lost touches."
+            "expected the same order of the balls in all cycles. Check the program and the record for lost touches.",
+            code="probing.balls.order",
         )
     raise MethodError(
         f"{where} was touched {off[k, i, j] * 1e3:.4g} mm from its touches in the other cycles; expected within "
-        f"{tolerance * 1e3:g} mm (ball_tolerance). Check whether the ball was displaced or another object was touched."
+        f"{tolerance * 1e3:g} mm (ball_tolerance). Check whether the ball was displaced or another object was touched.",
+        code="probing.ball.moved",
     )
 
 
@@ -198,12 +209,14 @@ def _check_cold(start: Array, valid: NDArray[np.bool_]) -> None:
     if late:
         raise MethodError(
             f"The cold cycle is missing: expected the first cycle at 0 s; found it at {start[0]:g} s. Probe the cold "
-            'machine, or use the first cycle as the reference (reference = "first").'
+            'machine, or use the first cycle as the reference (reference = "first").',
+            code="probing.cold.missing",
         )
     if not valid[0].any():
         raise MethodError(
             "The cold cycle is missing: cycle 0 has no good touch. Probe the cold machine, or remove the empty cycle "
-            'and use the first remaining one as the reference (reference = "first").'
+            'and use the first remaining one as the reference (reference = "first").',
+            code="probing.cold.missing",
         )
 
 
@@ -215,7 +228,8 @@ def _check_times(time: Array, valid: NDArray[np.bool_]) -> None:
         if last[before] > first[after]:
             raise MethodError(
                 f"touch_time: expected cycle {before} to end before cycle {after} starts; found {last[before]:g} s and "
-                f"{first[after]:g} s. The times of the touches must be on the clock of `time`."
+                f"{first[after]:g} s. The times of the touches must be on the clock of `time`.",
+                code="probing.times.order",
             )
 
 
@@ -228,7 +242,10 @@ def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touc
         if stated is None:
             return diagonal, float("nan")
         if not stated > 0:
-            raise MethodError(f"touch_noise: expected more than 0 m; found {stated:g} m. Omit it if it is unknown.")
+            raise MethodError(
+                f"touch_noise: expected more than 0 m; found {stated:g} m. Omit it if it is unknown.",
+                code="raw.noise.not_positive",
+            )
         return diagonal, stated
     if "centre_covariance" not in raw:
         return diagonal, float("nan")
@@ -237,11 +254,15 @@ def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touc
     known = np.all(np.isfinite(C), axis=(2, 3)) & there
     if (there & ~known).any():
         raise MethodError(
-            "centre_covariance: expected a covariance for every centre; found NaN. Omit it if it is unknown."
+            "centre_covariance: expected a covariance for every centre; found NaN. Omit it if it is unknown.",
+            code="probing.covariance.unknown",
         )
     C = np.where(known[..., None, None], C, np.eye(3))
     if not (np.linalg.eigvalsh(C) > 0).all():
-        raise MethodError("centre_covariance: expected positive definite matrices; found one that is not.")
+        raise MethodError(
+            "centre_covariance: expected positive definite matrices; found one that is not.",
+            code="probing.covariance.form",
+        )
     return np.linalg.inv(C) * known[..., None, None], 1.0
 
 

@@ -99,7 +99,8 @@ def spheres(position: Array, valid: NDArray[np.bool_]) -> tuple[Array, Array]:
         except FitError as error:
             raise MethodError(
                 f"Ball {i + 1} has no sphere through its touches in {int((count[i] > 0).sum())} directions: {error}. "
-                "Touch every ball five times or more, around it and on top."
+                "Touch every ball five times or more, around it and on top.",
+                code="probing.ball.no_sphere",
             ) from error
     return np.array([sphere.centre for sphere in found]), np.array([sphere.radius for sphere in found])
 

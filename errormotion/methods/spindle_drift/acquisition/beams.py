@@ -79,7 +79,8 @@ def control_of(bench: Bench) -> Any:
     if not hasattr(controller, "run_steps"):
         raise MethodError(
             "A beam detection needs an instrument of kind 'controller' that moves the sphere in steps (run_steps); the "
-            "bench has none. Add one, or use the beams of an earlier detection or the nominal beams."
+            "bench has none. Add one, or use the beams of an earlier detection or the nominal beams.",
+            code="bench.controller.no_steps",
         )
     return controller
 
@@ -150,4 +151,7 @@ def _record_scan(
         if pending:  # samples before the failure are kept
             yield chunk()
         raise
-    raise MethodError(f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.")
+    raise MethodError(
+        f"Channel {name}: the stream ended at {taken / frame.rate:.1f} s of {length / frame.rate:.1f} s.",
+        code="stream.ended",
+    )

@@ -87,7 +87,9 @@ def record_drift(
         if pending.samples:  # samples before the failure are kept
             yield pending.chunk()
         raise
-    raise MethodError(f"The stream ended at {pending.end / rate:.1f} s of {settings.duration:g} s.")
+    raise MethodError(
+        f"The stream ended at {pending.end / rate:.1f} s of {settings.duration:g} s.", code="stream.ended"
+    )
 
 
 def starts_schedules(bench: Bench) -> bool:
@@ -129,7 +131,8 @@ def _current_sample(done: xr.Dataset, rate: float) -> int:
     except ValueError as error:
         raise MethodError(
             f"The interrupted record cannot be continued: {error}; expected UTC such as 2025-03-01T08:00:00+00:00. "
-            "Start a new run."
+            "Start a new run.",
+            code="run.start.missing",
         ) from error
     return int(done.sizes["time"]) + 1 if math.isnan(seconds) else round(seconds * rate)
 
@@ -147,7 +150,8 @@ def warmth(frame: Any, done: xr.Dataset | None) -> int:
     if before > now:
         raise MethodError(
             "The sensors were warm before the interruption, and have been switched on again since. Continue when they "
-            "are warm, or start a new run."
+            "are warm, or start a new run.",
+            code="run.sensors.warming",
         )
     return before
 

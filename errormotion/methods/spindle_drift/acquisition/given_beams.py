@@ -37,7 +37,8 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
     if unknown:
         raise MethodError(
             f"inputs: expected '{ALL_BEAMS}' or the names of channels ({', '.join(CHANNELS)}); "
-            f"found {', '.join(unknown)}"
+            f"found {', '.join(unknown)}",
+            code="beams.input.names",
         )
     if not inputs:
         return None
@@ -46,7 +47,8 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
     if len(frames) > 1:
         raise MethodError(
             f"The beams are stated in several frames ({', '.join(sorted(frames))}); expected one. Convert them to one "
-            "frame with ds.em.in_frame."
+            "frame with ds.em.in_frame.",
+            code="beams.input.frames",
         )
     return xr.concat(found, dim="beam", join="override", combine_attrs="override").assign_coords(beam=list(CHANNELS))
 
@@ -56,26 +58,33 @@ def _beam(inputs: Mapping[str, xr.Dataset], channel: str) -> xr.Dataset:
     if key not in inputs:
         raise MethodError(
             f"inputs: no beam for {channel}; found {', '.join(inputs)}. Expected one for each of "
-            f"{', '.join(CHANNELS)}, or all of them as '{ALL_BEAMS}'."
+            f"{', '.join(CHANNELS)}, or all of them as '{ALL_BEAMS}'.",
+            code="beams.input.missing",
         )
     ds = inputs[key]
     missing = [name for name in REQUIRED if name not in ds.variables]
     if missing:
         raise MethodError(
-            f"inputs: '{key}' is not the result of a beam detection or beam direction; missing: {', '.join(missing)}"
+            f"inputs: '{key}' is not the result of a beam detection or beam direction; missing: {', '.join(missing)}",
+            code="beams.input.other",
         )
     if key == ALL_BEAMS:
         if channel not in ds["beam"].values:
             names = ", ".join(str(name) for name in ds["beam"].values)
-            raise MethodError(f"inputs: '{key}' contains the beams {names}; expected {channel} as well")
+            raise MethodError(
+                f"inputs: '{key}' contains the beams {names}; expected {channel} as well", code="beams.input.missing"
+            )
         one = ds[list(REQUIRED)].sel(beam=[channel])
     else:
         if ds.sizes.get("beam") != 1:
-            raise MethodError(f"inputs: expected one beam in '{key}'; found {ds.sizes.get('beam', 0)}")
+            raise MethodError(
+                f"inputs: expected one beam in '{key}'; found {ds.sizes.get('beam', 0)}", code="beams.input.several"
+            )
         one = ds[list(REQUIRED)].assign_coords(beam=[channel])
     if not np.isfinite(one["beam_origin"].values).all():
         raise MethodError(
             f"inputs: the zero point of beam {channel} is unknown, because its planes had no known points. Measure it "
-            "on three planes with known points (layout.pivot), or by a beam detection."
+            "on three planes with known points (layout.pivot), or by a beam detection.",
+            code="beams.input.no_zero",
         )
     return one.transpose("beam", ...).reset_coords(drop=True)

@@ -48,7 +48,8 @@ def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
     if not (isinstance(origin, Mapping) and isinstance(direction, Mapping) and set(CHANNELS) <= set(origin)):
         raise MethodError(
             "beam_detection: expected an instrument 'spindle_frame' whose settings state the beams (origin, "
-            "direction); without them the positions of the sphere are unknown"
+            "direction); without them the positions of the sphere are unknown",
+            code="beams.frame.not_stated",
         )
     unit = np.array([direction[name] for name in CHANNELS], np.float64)
     frame_position = np.array(getattr(frame, "machine_position", (0.0, 0.0, 0.0)), np.float64)

@@ -308,6 +308,7 @@ def slices(raw: xr.Dataset) -> Iterator[tuple[Times, xr.Dataset]]:
             time = EvenTimes(float(raw.attrs.get("time_start", 0.0)) + first * interval, interval, part.sizes["time"])
         else:
             raise MethodError(
-                "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz)."
+                "The raw dataset has no time: expected a coordinate 'time' (s) or the attribute 'sample_rate' (Hz).",
+                code="raw.time.missing",
             )
         yield time, part

@@ -132,7 +132,8 @@ def likelihood_fit(
         raise MethodError(
             f"Beam {name}: {used.sum()} of {used.size} readings are valid; expected more than {UNKNOWNS}, the number "
             "of "
-            "unknowns."
+            "unknowns.",
+            code="readings.too_few",
         )
     direction = direction / np.linalg.norm(direction)
     origin, direction = _first_shift(distance, centre, radius, origin, direction, used)
@@ -151,18 +152,20 @@ def likelihood_fit(
         solved = solve(observed)
     except MethodError as error:
         if "do not determine" in str(error):
-            raise MethodError(_UNDETERMINED.format(name)) from error
+            raise MethodError(_UNDETERMINED.format(name), code="beam.undetermined") from error
         if "converge" not in str(error):
-            raise MethodError(f"Beam {name}: {error}") from error
+            raise MethodError(f"Beam {name}: {error}", code=error.code) from error
         raise MethodError(
             f"Beam {name}: the fit does not converge. Check the nominal origin and direction (m, machine coordinates), "
-            f"the sphere radius ({radius * 1e3:g} mm) and that the sphere centres belong to the readings."
+            f"the sphere radius ({radius * 1e3:g} mm) and that the sphere centres belong to the readings.",
+            code="beam.not_converged",
         ) from error
     kept = np.isfinite(solved.white.problem.readings).reshape(used.shape)
     if kept.sum() < _MIN_USED * used.sum():
         raise MethodError(
             f"Beam {name}: more than {1 - _MIN_USED:.0%} of the readings do not fit any beam. Check that the sphere "
-            "centres belong to the readings."
+            "centres belong to the readings.",
+            code="beam.readings.differ",
         )
     errors = solved.relative.errors
     found, along = errors.value[0, :3], errors.value[0, 3:]
@@ -170,7 +173,7 @@ def likelihood_fit(
     J = jacobian[kept & np.isfinite(reading)]
     size = np.linalg.norm(J, axis=0)
     if not size.all() or np.linalg.cond(J / size) > 1e6:
-        raise MethodError(_UNDETERMINED.format(name))
+        raise MethodError(_UNDETERMINED.format(name), code="beam.undetermined")
     influence = {source.name: source.effect[0] for source in errors.sources}
     return Beam(
         origin=found,

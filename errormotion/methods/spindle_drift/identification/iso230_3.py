@@ -264,7 +264,10 @@ def _thermometer(
 ) -> tuple[str, Array | None]:
     """Return name and temperature (t,) of the given sensor, or of the one with the largest change while running."""
     if given is not None and given not in sensors:
-        raise MethodError(f"iso_temperature = '{given}': expected one of the sensors {', '.join(sensors) or 'none'}.")
+        raise MethodError(
+            f"iso_temperature = '{given}': expected one of the sensors {', '.join(sensors) or 'none'}.",
+            code="drift.temperature.unknown",
+        )
     if temperature is None or not running.any():
         return "", None
     part = temperature[:, running]

@@ -243,7 +243,10 @@ def _pieces(
         for time, part in slices(raw):
             first, end = first_and_last(time)
             if not (last < first and increases(time) and np.isfinite([first, end]).all()):
-                raise MethodError("The time of the record does not increase everywhere: expected increasing seconds.")
+                raise MethodError(
+                    "The time of the record does not increase everywhere: expected increasing seconds.",
+                    code="raw.time.not_increasing",
+                )
             _, *_, windows = (None, *(each.windows(time) for each in averagers.values()))  # the same for all
             running.append(pool.submit(work, time, part, done, windows))
             last, done = end, done + time.size
@@ -271,7 +274,10 @@ def count_unknown(averages: Averages, notes: list[str]) -> None:
     for channel, row, counts in zip(CHANNELS, averages.mean, averages.count, strict=True):
         unknown = np.isnan(row)
         if unknown.all():
-            raise MethodError(f"Channel {channel} has no valid reading in the record. Check the sensor and its cable.")
+            raise MethodError(
+                f"Channel {channel} has no valid reading in the record. Check the sensor and its cable.",
+                code="drift.channel.no_readings",
+            )
         if unknown.any():
             first, last = averages.time[unknown][[0, -1]]
             notes.append(
@@ -296,7 +302,8 @@ def reference_windows(
         if later.size == 0:
             raise MethodError(
                 f"The record ends at {averages.time[-1]:.1f} s, before the start of the reference state at "
-                f"{start:g} s (reference_time)."
+                f"{start:g} s (reference_time).",
+                code="drift.reference.outside",
             )
         inside[later[0]] = True
     steady = np.flatnonzero(inside & ~coming_up)
@@ -311,7 +318,8 @@ def reference_windows(
         lost = [c for c, row in zip(CHANNELS, mean[:, inside], strict=True) if np.isnan(row).all()]
         raise MethodError(
             f"The reference state at {start:.1f} s has no valid reading of {', '.join(lost) or 'all channels together'}"
-            ". Choose another reference state with reference_time and reference_average."
+            ". Choose another reference state with reference_time and reference_average.",
+            code="drift.reference.no_readings",
         )
     return np.flatnonzero(known)
 

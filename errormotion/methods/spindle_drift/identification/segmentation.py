@@ -79,12 +79,16 @@ def segment_steps(distance: Array, rate: float, steps: int, dwell: float, averag
     """
     if average > 0.5 * dwell:
         raise MethodError(
-            f"Averaging {average:g} s from the middle of a rest of {dwell:g} s: expected at most {dwell / 2:g} s."
+            f"Averaging {average:g} s from the middle of a rest of {dwell:g} s: expected at most {dwell / 2:g} s.",
+            code="detection.average.too_long",
         )
     tick = max(1, round(rate * _TICK))
     ticks = distance.size // tick
     if ticks < 10:
-        raise MethodError(f"The record holds {distance.size / rate:.1f} s; expected {steps} steps of {dwell:g} s.")
+        raise MethodError(
+            f"The record holds {distance.size / rate:.1f} s; expected {steps} steps of {dwell:g} s.",
+            code="detection.record.too_short",
+        )
     blocks = distance[: ticks * tick].reshape(ticks, tick)
     valid = np.isfinite(blocks)
     number = valid.sum(axis=1)
@@ -95,14 +99,16 @@ def segment_steps(distance: Array, rate: float, steps: int, dwell: float, averag
     if not 0.95 * dwell < period < 1.5 * dwell:
         raise MethodError(
             f"The scan lasts {back - out:.1f} s from its move out to its move back, {period:.3f} s a step for {steps} "
-            f"steps; expected about {dwell:g} s. Check the number of steps and the dwell."
+            f"steps; expected about {dwell:g} s. Check the number of steps and the dwell.",
+            code="detection.steps.count",
         )
     start, period = _refine(level, seconds, steps, out, period)
     first = np.round((start + (np.arange(steps) + 0.5) * period) * rate).astype(np.int64)
     length = max(1, round(average * rate))
     if first[-1] + length > distance.size:
         raise MethodError(
-            "The record ends before the last step. Record until the machine is back at its start position."
+            "The record ends before the last step. Record until the machine is back at its start position.",
+            code="detection.record.too_short",
         )
     rests = distance[first[:, None] + np.arange(length)]
     count = np.isfinite(rests).sum(axis=1)
@@ -123,7 +129,8 @@ def _large_moves(level: Array, seconds: float, steps: int, dwell: float) -> tupl
     if change.size <= least:
         raise MethodError(
             f"The record holds {level.size * seconds:.1f} s; a scan of {steps} steps needs more than "
-            f"{steps * dwell:g} s."
+            f"{steps * dwell:g} s.",
+            code="detection.record.too_short",
         )
     # The pair of changes, at least a scan apart, with the largest sum.
     before = np.maximum.accumulate(change)
@@ -134,7 +141,8 @@ def _large_moves(level: Array, seconds: float, steps: int, dwell: float) -> tupl
     if not min(change[out], change[back]) > _MOVE_RATIO * ordinary or out + rest >= back:
         raise MethodError(
             "The record shows no large moves out and back: expected the sphere to move to one end of the scan, step "
-            "through it and return. Check that the program ran and that the sphere was in the beam."
+            "through it and return. Check that the program ran and that the sphere was in the beam.",
+            code="detection.no_moves",
         )
     return (out + quiet) * seconds, (back + quiet) * seconds
 

@@ -41,7 +41,8 @@ class Setup:
         if not abs(levels[1] - levels[0]) > 1e-3:
             raise MethodError(
                 f"The levels L1 and L2 are {levels[0] * 1e3:g} mm and {levels[1] * 1e3:g} mm: expected two heights at "
-                "least 1 mm apart."
+                "least 1 mm apart.",
+                code="drift.levels.too_close",
             )
         return cls(*_beams(raw, settings, notes), float(raw["bar_radius"]), levels)
 
@@ -54,7 +55,8 @@ class Setup:
         if leaving:
             raise MethodError(
                 f"The beam of {', '.join(leaving)} points away from the bar. Expected beam_direction from the sensor "
-                "to the bar, and readings that increase with the distance of the bar; check the sign of the direction."
+                "to the bar, and readings that increase with the distance of the bar; check the sign of the direction.",
+                code="drift.beam.opposite",
             )
 
 
@@ -64,7 +66,8 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     if nominal and "nominal_origin" not in raw:
         raise MethodError(
             "beams = 'nominal' needs nominal_origin and nominal_direction(channel, direction), which the raw dataset "
-            "does not have. Use beams = 'raw'."
+            "does not have. Use beams = 'raw'.",
+            code="drift.nominal_beams.missing",
         )
     of_channel = raw[[f"{'nominal' if nominal else 'beam'}_{part}" for part in ("origin", "direction")]]
     origin, direction = (
@@ -72,7 +75,10 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
     )
     if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
         lost = [c for c, o, u in zip(CHANNELS, origin, direction, strict=True) if not np.isfinite([*o, *u]).all()]
-        raise MethodError(f"The beam of {', '.join(lost)} is unknown (NaN); expected origin and direction of all five.")
+        raise MethodError(
+            f"The beam of {', '.join(lost)} is unknown (NaN); expected origin and direction of all five.",
+            code="drift.beam.unknown",
+        )
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     flat = direction[:SIDE, :2] / np.linalg.norm(direction[:SIDE, :2], axis=1, keepdims=True)
     for i, j in ((0, 2), (0, 3), (1, 2), (1, 3)):
@@ -81,7 +87,8 @@ def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array
             raise MethodError(
                 f"The beams {CHANNELS[i]} and {CHANNELS[j]} are parallel within {np.degrees(np.arcsin(sine)):.1f} "
                 "deg, so that they do not determine the position of the bar. Expected X beams across Y beams; check "
-                "beam_direction."
+                "beam_direction.",
+                code="drift.beams.parallel",
             )
     if nominal:
         covariance = np.zeros((5, 6, 6))

@@ -119,7 +119,9 @@ def fit(p: Array, start: Bar, shape: str, radius: float | None) -> Bar:
         if np.abs(step[:2]).max() < _CONVERGED:
             break
     else:
-        raise FitError("the fit of the bar does not converge. Check the radius and the axis")
+        raise FitError(
+            "the fit of the bar does not converge. Check the radius and the axis", code="beam.bar.not_converged"
+        )
     middle = float(((p - bar.centre) @ bar.axis).mean())
     return Bar(bar.centre + middle * bar.axis, bar.axis, bar.radius, bar.tilts, bar.fixed_radius)
 

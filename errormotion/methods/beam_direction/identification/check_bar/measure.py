@@ -142,13 +142,15 @@ def fit_bar(
     p, own, influence, reading = _points(scanned, noise)
     u = np.asarray(axis, float)
     if u.shape != (3,) or not np.linalg.norm(u) > 0:
-        raise MethodError(f"axis: expected the direction of the bar, three numbers; found {u.tolist()}.")
+        raise MethodError(
+            f"axis: expected the direction of the bar, three numbers; found {u.tolist()}.", code="beam.bar.axis"
+        )
     if radius is not None and not radius > 0:
-        raise MethodError(f"radius: expected a positive length; found {radius}.")
+        raise MethodError(f"radius: expected a positive length; found {radius}.", code="beam.bar.radius")
     if hold_radius and radius is None:
-        raise MethodError("hold_radius: expected the radius to be fixed; found none.")
+        raise MethodError("hold_radius: expected the radius to be fixed; found none.", code="beam.bar.hold_radius")
     if shape not in ("circle", "cylinder"):
-        raise MethodError(f"shape: expected 'circle' or 'cylinder'; found '{shape}'.")
+        raise MethodError(f"shape: expected 'circle' or 'cylinder'; found '{shape}'.", code="beam.bar.shape")
     u = u / np.linalg.norm(u)
     known = np.flatnonzero(np.isfinite(p).all(axis=1))
     initial, outliers = start(p[known], own[known], u, shape, robust)
@@ -238,7 +240,10 @@ def measure_bar(
     """
     missing = [name for name in ("bar_distance", "bar_stage", "bar_axis") if name not in raw]
     if missing:
-        raise MethodError(f"Expected readings of a check bar in the raw dataset; {', '.join(missing)} missing.")
+        raise MethodError(
+            f"Expected readings of a check bar in the raw dataset; {', '.join(missing)} missing.",
+            code="beam.bar.readings_missing",
+        )
     axis = raw["bar_axis"].values
     speckle = float(raw["speckle"]) if "speckle" in raw else 0.0
     scanned = points(
@@ -292,13 +297,15 @@ def _points(scanned: Points | ArrayLike, noise: float | None) -> tuple[Array, Ar
     """Return points (n, 3), their independent covariance, influence of shared sources, and their readings."""
     if isinstance(scanned, Points):
         if noise is not None:
-            raise MethodError("noise: expected for coordinates only; the points of a scan state their noise.")
+            raise MethodError(
+                "noise: expected for coordinates only; the points of a scan state their noise.", code="beam.bar.noise"
+            )
         return scanned.points, scanned.covariance, scanned.influence, scanned.reading
     p = np.asarray(scanned, float)
     if p.ndim != 2 or p.shape[1] != 3:
-        raise MethodError(f"Expected points (n, 3), one per row; found {p.shape}.")
+        raise MethodError(f"Expected points (n, 3), one per row; found {p.shape}.", code="beam.bar.points")
     if noise is not None and not noise >= 0:
-        raise MethodError(f"noise: expected a standard deviation in m; found {noise}.")
+        raise MethodError(f"noise: expected a standard deviation in m; found {noise}.", code="beam.bar.noise")
     own = np.broadcast_to((noise or 0.0) ** 2 * np.eye(3), (len(p), 3, 3))
     return p, np.asarray(own), np.zeros((0, len(p), 3)), None
 

@@ -51,7 +51,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
     """
     moves = raw.attrs.get("moves", settings.moves)
     if moves not in ("sensor", "target"):
-        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.")
+        raise MethodError(f"attribute moves: expected 'sensor' or 'target'; found {moves!r}.", code="raw.moves.form")
     u0 = np.asarray(raw["nominal_direction"].values, np.float64)
     p0 = np.asarray(raw["nominal_origin"].values if "nominal_origin" in raw else np.full(3, np.nan), np.float64)
     notes = ["A check bar only: the stated beam is used, without uncertainty; its errors are unknown."]
@@ -122,7 +122,7 @@ def bar_extras(
         except (MethodError, FitError):  # no bar with the opposite side
             confirmed = True
         if not confirmed:
-            raise MethodError(_CONTRADICTION)
+            raise MethodError(_CONTRADICTION, code="beam.bar.calibration_contradicts")
     notes.extend(f"Check bar: {note}" for note in (*points.notes, *bar.notes))
     left_out = np.zeros(len(bar.residuals), np.int8)
     left_out[list(bar.left_out)] = 1

@@ -134,13 +134,15 @@ def points(
     """
     r, s = np.asarray(reading, float), np.asarray(stage, float)
     if r.ndim != 1 or s.shape != (len(r), 3):
-        raise MethodError(f"Expected readings (n,) and stage positions (n, 3); found {r.shape} and {s.shape}.")
+        raise MethodError(
+            f"Expected readings (n,) and stage positions (n, 3); found {r.shape} and {s.shape}.", code="beam.scan.shape"
+        )
     beam = _beam(origin, direction, covariance)
     measured = np.isfinite(r) & np.isfinite(s).all(axis=1)
     if not measured.any():
-        raise MethodError("Expected readings; found only NaN.")
+        raise MethodError("Expected readings; found only NaN.", code="beam.scan.no_readings")
     if moves not in ("sensor", "target"):
-        raise MethodError(f"moves: expected 'sensor' or 'target'; found '{moves}'.")
+        raise MethodError(f"moves: expected 'sensor' or 'target'; found '{moves}'.", code="raw.moves.form")
     positions = s[measured] if moves == "sensor" else -s[measured]
     scan = _Scan(r[measured], positions, beam, calibration, triangulation_normal, mid_range, extrapolate)
     surface, notes = _surface(normals, measured, scan)
@@ -205,7 +207,8 @@ class _Scan:
         if self.triangulation_normal is None:
             raise MethodError(
                 "Expected triangulation_normal with a calibration: the normal of the plane of the emitted and the "
-                "received beam, which states the rotation of the sensor about its beam."
+                "received beam, which states the rotation of the sensor about its beam.",
+                code="beam.scan.triangulation_normal",
             )
         return np.asarray(tilt(self.beam[1] if direction is None else direction, self.triangulation_normal, normals))
 
@@ -214,7 +217,8 @@ class _Scan:
         cosine = -(normals @ self.direction)
         if not (np.abs(cosine) > _ROUNDING).all():
             raise MethodError(
-                "The beam is parallel to the surface at some points, where no reading is possible. Check the normals."
+                "The beam is parallel to the surface at some points, where no reading is possible. Check the normals.",
+                code="beam.scan.parallel",
             )
         return np.asarray(normals * np.sign(cosine)[:, None])
 
@@ -223,15 +227,22 @@ def _beam(origin: ArrayLike, direction: ArrayLike, covariance: ArrayLike | None)
     p0, u = np.asarray(origin, float), np.asarray(direction, float)
     if p0.shape != (3,) or not np.isfinite(p0).all():
         raise MethodError(
-            f"Expected the beam's origin, three lengths; found {p0.tolist()}. State 0 0 0 for form and size only."
+            f"Expected the beam's origin, three lengths; found {p0.tolist()}. State 0 0 0 for form and size only.",
+            code="beam.scan.origin",
         )
     if u.shape != (3,) or not abs(np.linalg.norm(u) - 1) <= _UNIT_NORM:
-        raise MethodError(f"Expected the beam's direction, a unit vector of three numbers; found {u.tolist()}.")
+        raise MethodError(
+            f"Expected the beam's direction, a unit vector of three numbers; found {u.tolist()}.",
+            code="beam.scan.direction",
+        )
     if covariance is None:
         return p0, u, None
     C = np.asarray(covariance, float)
     if C.shape != (6, 6) or not np.isfinite(C).all():
-        raise MethodError(f"Expected the covariance of (origin, direction), 6 x 6 numbers; found {C.shape}.")
+        raise MethodError(
+            f"Expected the covariance of (origin, direction), 6 x 6 numbers; found {C.shape}.",
+            code="beam.scan.covariance",
+        )
     return p0, u, C
 
 
@@ -244,7 +255,10 @@ def _surface(
     if normals is not None:
         N = np.asarray(normals, float)
         if N.shape != (len(measured), 3) or not (np.abs(np.linalg.norm(N[measured], axis=1) - 1) <= _UNIT_NORM).all():
-            raise MethodError(f"Expected unit normals ({len(measured)}, 3), one for each reading; found {N.shape}.")
+            raise MethodError(
+                f"Expected unit normals ({len(measured)}, 3), one for each reading; found {N.shape}.",
+                code="beam.scan.normals",
+            )
         return scan.facing(N[measured]), ()
     if scan.calibration is None:
         return None, ()
@@ -255,7 +269,8 @@ def _surface(
     axis = np.cross(directions[0], scan.direction)
     if np.linalg.norm(axis) < 1e-3:
         raise MethodError(
-            "The stage moved only along the beam: the tilt cannot be determined from such a scan. State the normals."
+            "The stage moved only along the beam: the tilt cannot be determined from such a scan. State the normals.",
+            code="beam.scan.along_beam",
         )
     note = (
         "The scan is along one line, which determines only the tilt in the plane of the scan; the tilt across it "
@@ -281,7 +296,8 @@ def _converged(scan: _Scan, surface: Array | Surface | None) -> tuple[Array, Arr
     raise MethodError(
         f"Normals and points do not converge: after {MAX_ITERATIONS} iterations the points still change by "
         f"{1e6 * change:.3g} um. The distance of the neighbours is too small for the noise: use more neighbours, or "
-        "state the surface, such as round_bar(axis)."
+        "state the surface, such as round_bar(axis).",
+        code="beam.scan.not_converged",
     )
 
 
@@ -338,6 +354,8 @@ def factors(covariance: Array) -> Array:
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / scale[:, None] / scale)
     if values[0] < -1e-8 * max(values[-1], 1.0):
-        raise MethodError("Expected a covariance; found a matrix with a negative eigenvalue.")
+        raise MethodError(
+            "Expected a covariance; found a matrix with a negative eigenvalue.", code="beam.scan.covariance"
+        )
     kept = values > 1e-12 * max(values[-1], 0.0)
     return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T * scale)

@@ -39,7 +39,10 @@ def along_curve(axis: ArrayLike, neighbours: int = 7) -> Surface:
         chord = window[:, -1] - window[:, 0]
         length = np.linalg.norm(chord, axis=1, keepdims=True)
         if (length == 0).any():
-            raise MethodError("Expected different points; found neighbours at the same position. Omit repeated points.")
+            raise MethodError(
+                "Expected different points; found neighbours at the same position. Omit repeated points.",
+                code="beam.scan.points_repeated",
+            )
         tangent = chord / length
         x = np.einsum("nki,ni->nk", window, tangent) / length
         y = (tangent[:, None, 0] * window[..., 1] - tangent[:, None, 1] * window[..., 0]) / length
@@ -64,13 +67,17 @@ def over_surface(neighbours: int = 12) -> Surface:
         window = window - p[:, None]
         size = np.linalg.norm(window, axis=-1).max(axis=1)
         if (size == 0).any():
-            raise MethodError("Expected different points; found neighbours at the same position. Omit repeated points.")
+            raise MethodError(
+                "Expected different points; found neighbours at the same position. Omit repeated points.",
+                code="beam.scan.points_repeated",
+            )
         window = window / size[:, None, None]
         _, spread, frame = np.linalg.svd(window - window.mean(axis=1, keepdims=True))
         if (spread[:, 1] < 1e-3 * spread[:, 0]).any():
             raise MethodError(
                 "Neighbouring points lie on one line, which determines only the tilt along it. Use more neighbours, "
-                "space the lines of the scan like the points on them, or state the surface, such as round_bar(axis)."
+                "space the lines of the scan like the points on them, or state the surface, such as round_bar(axis).",
+                code="beam.scan.points_on_line",
             )
         x, y, z = np.moveaxis(np.einsum("nki,nji->nkj", window, frame), -1, 0)
         slope = _slopes(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1), z)[:, 1:3]
@@ -102,18 +109,21 @@ def _slopes(A: Array, y: Array) -> Array:
 def _unit(vector: ArrayLike, name: str) -> Array:
     v = np.asarray(vector, float)
     if v.shape != (3,) or not np.linalg.norm(v) > 0:
-        raise MethodError(f"{name}: expected three numbers that are not all 0; found {v.tolist()}.")
+        raise MethodError(
+            f"{name}: expected three numbers that are not all 0; found {v.tolist()}.", code="beam.bar.axis"
+        )
     return np.asarray(v / np.linalg.norm(v))
 
 
 def _check_neighbours(neighbours: int, least: int) -> None:
     if neighbours < least:
-        raise MethodError(f"neighbours: expected at least {least}; found {neighbours}.")
+        raise MethodError(f"neighbours: expected at least {least}; found {neighbours}.", code="beam.scan.neighbours")
 
 
 def _check_points(n: int, least: int) -> None:
     if n < least:
         raise MethodError(
             f"Expected {least} points or more to determine normals; found {n}. State the normals, or measure more "
-            "points."
+            "points.",
+            code="beam.scan.points_too_few",
         )

@@ -110,7 +110,8 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     settings = settings or Settings()
     if raw.attrs.get("schema") != INCLINATION_SCHEMA:
         raise MethodError(
-            f"Expected readings of the schema {INCLINATION_SCHEMA}; found {raw.attrs.get('schema', 'none')}."
+            f"Expected readings of the schema {INCLINATION_SCHEMA}; found {raw.attrs.get('schema', 'none')}.",
+            code="schema.other",
         )
     validate(raw)
     raw = raw.load()
@@ -151,13 +152,15 @@ def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.boo
     if different < _MIN_TILTS:
         raise MethodError(
             f"Expected at least {_MIN_TILTS} different tilts of the surface, for the cross-validation; found "
-            f"{different}. Measure more inclinations and rotations."
+            f"{different}. Measure more inclinations and rotations.",
+            code="inclination.tilts.too_few",
         )
     if settings.order is not None and settings.order not in fits:
         count = len(inclination_surface.degrees_to(settings.order, bool(settings.mirror)))
         raise MethodError(
             f"order: expected fewer coefficients than different tilts, {different}; found {count} at order "
-            f"{settings.order}. Use order {fits[-1]} or less, or measure more settings."
+            f"{settings.order}. Use order {fits[-1]} or less, or measure more settings.",
+            code="inclination.order.too_high",
         )
     x = half_tilt(q)
     kept = np.ones(len(q), dtype=bool)

@@ -118,12 +118,15 @@ def read(raw: xr.Dataset, receiver_rotation: float | None = None) -> Readings:
     )
     known = np.isfinite(r) & np.isfinite(d)
     if not known.any():
-        raise MethodError("Every reading is missing (NaN); expected readings of the sensor against the interferometer.")
+        raise MethodError(
+            "Every reading is missing (NaN); expected readings of the sensor against the interferometer.",
+            code="inclination.no_readings",
+        )
     r, d, alpha, beta = r[known], d[known], alpha[known], beta[known]
     m = float(raw["mid_range"]) if "mid_range" in raw.variables else 0.0
     _check(r, d, m)
     if np.abs(alpha).max() < SAME:
-        raise MethodError("Every inclination is 0; expected several inclinations.")
+        raise MethodError("Every inclination is 0; expected several inclinations.", code="inclination.all_zero")
     turn = _turn(raw, receiver_rotation)
     if turn:
         beta = np.mod(beta + turn + np.pi, 2 * np.pi) - np.pi
@@ -152,13 +155,15 @@ def _turn(raw: xr.Dataset, receiver_rotation: float | None) -> float:
             "receiver_rotation: expected the rotation at which the normal of the surface leans towards the receiver of "
             "the sensor, 0 or 180 deg; found none. Add it to the readings ('# receiver_rotation = 180 deg' in a text "
             "file), or state it: --set receiver_rotation=180deg. To find out, tilt the surface by 65 deg or more in "
-            "the plane of laser and receiver: turned away from the receiver, it is dark for the sensor first."
+            "the plane of laser and receiver: turned away from the receiver, it is dark for the sensor first.",
+            code="inclination.receiver.missing",
         )
     turn = float(np.mod(np.pi - receiver_rotation + np.pi, 2 * np.pi) - np.pi)
     if min(abs(turn), np.pi - abs(turn)) > RECEIVER_TOLERANCE:
         raise MethodError(
             f"receiver_rotation: expected 0 or 180 deg, because rotations are measured from the plane of laser and "
-            f"receiver; found {np.degrees(receiver_rotation):.4g} deg. Measure the rotations from that plane."
+            f"receiver; found {np.degrees(receiver_rotation):.4g} deg. Measure the rotations from that plane.",
+            code="inclination.receiver.form",
         )
     return 0.0 if abs(turn) <= RECEIVER_TOLERANCE else np.pi
 
@@ -167,18 +172,21 @@ def _check(r: Array, d: Array, m: float) -> None:
     """Refuse implausible readings and references."""
     if np.ptp(d) < 1e-6:
         raise MethodError(
-            f"The reference is constant, {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor."
+            f"The reference is constant, {1e3 * d[0]:.4f} mm; expected depths over the range of the sensor.",
+            code="inclination.reference.constant",
         )
     ratio = float(np.cov(r, d)[0, 1] / d.var(ddof=1)) if len(d) > 1 else 1.0
     if abs(ratio) < 1e-4:
         raise MethodError(
             f"The readings stay near {1e3 * np.median(r):.4f} mm while the reference moves by {1e3 * np.ptp(d):.3f} "
-            "mm; expected the same displacement. Check the column of the readings."
+            "mm; expected the same displacement. Check the column of the readings.",
+            code="inclination.readings.constant",
         )
     if ratio < 0:
         raise MethodError(
             "The readings decrease where the reference increases. Change the sign of the reference, so that both "
-            "increase with the depth."
+            "increase with the depth.",
+            code="inclination.readings.opposite",
         )
     if not 0.8 < ratio < 1.25:
         units = {
@@ -188,14 +196,16 @@ def _check(r: Array, d: Array, m: float) -> None:
         check = next((text for factor, text in units.items() if 0.8 < ratio * factor < 1.25), "the units")
         raise MethodError(
             f"The readings change {ratio:.4g} times as much as the reference; expected a ratio of about 1. Check "
-            f"{check}."
+            f"{check}.",
+            code="inclination.readings.scale",
         )
     low, high = float(d.min() - m), float(d.max() - m)
     if min(-low, high) < 0.05 * (high - low):
         raise MethodError(
             f"The depths are from {1e3 * low:.3f} to {1e3 * high:.3f} mm relative to mid-range ({1e3 * m:.3f} mm), on "
             "one side; expected both sides, because the error changes its sign there. Check `mid_range` and the sign "
-            "of the reference."
+            "of the reference.",
+            code="inclination.depths.one_side",
         )
 
 
@@ -220,7 +230,8 @@ def fit(readings: Readings, offsets: str = "auto") -> Lines:
         k = int(np.argmin(count))
         raise MethodError(
             f"{_name(readings, k)} has only one reading, which does not determine its zero; expected two readings or "
-            "more, or the setting offsets = 'none'."
+            "more, or the setting offsets = 'none'.",
+            code="inclination.setting.one_reading",
         )
     slope, offset = _start(readings, free)
     kept = np.ones(len(readings.error), dtype=bool)
@@ -287,7 +298,8 @@ def _require_depth(readings: Readings, enough: NDArray[np.bool_]) -> None:
     if not enough.all():
         raise MethodError(
             f"{_name(readings, int(np.argmin(enough)))} has readings at only one depth; expected several depths, which "
-            "determine the slope of the error. Remove the setting or repeat its measurement."
+            "determine the slope of the error. Remove the setting or repeat its measurement.",
+            code="inclination.setting.one_depth",
         )
 
 
@@ -298,7 +310,8 @@ def _noise(residual: Array, freedom: int, stated: float) -> float:
     if not np.isfinite(stated):
         raise MethodError(
             f"Expected at least {MIN_FREEDOM} readings more than unknowns to estimate the noise, or `reading_noise` in "
-            f"the data; found {freedom}."
+            f"the data; found {freedom}.",
+            code="readings.too_few",
         )
     return max(stated, _MIN_NOISE)
 

@@ -152,11 +152,13 @@ def calibrate(
     if z.ndim != 3 or points.shape != z.shape[2:] or s.shape != (*z.shape[:2], 3):
         raise MethodError(
             "Expected x (point), height (scan, line, point) and stage (scan, line, 3); found "
-            f"{points.shape}, {z.shape} and {s.shape}."
+            f"{points.shape}, {z.shape} and {s.shape}.",
+            code="scan.pocket.shape",
         )
     if np.ptp(s[..., 2], axis=1).max() > 1e-6:
         raise MethodError(
-            "Expected one height of the spindle for each scan of the pocket; Z of the stage changes within a scan."
+            "Expected one height of the spindle for each scan of the pocket; Z of the stage changes within a scan.",
+            code="scan.pocket.heights",
         )
     fit = _Fit([_scan(points, *pair) for pair in zip(z, s, strict=True)], pocket, angle_prior)
     return fit.solve()
@@ -183,7 +185,8 @@ def calibrate_dataset(raw: xr.Dataset, *, angle_prior: float | None = None) -> P
     if "pocket_radius" not in raw:
         raise MethodError(
             "Expected scans of a pocket (a raw dataset of crossbeam_scan with pocket_radius); found "
-            f"{raw.attrs['schema']} with {', '.join(map(str, raw.data_vars))}."
+            f"{raw.attrs['schema']} with {', '.join(map(str, raw.data_vars))}.",
+            code="scan.pocket.missing",
         )
     names = ("radius", "radius_uncertainty", "centre", "centre_uncertainty")
     known: dict[str, Any] = {name: raw[f"pocket_{name}"].values for name in names if f"pocket_{name}" in raw}
@@ -245,7 +248,9 @@ class _Fit:
         fitted = used
         for _ in range(4):
             if (lines := int(used.sum())) < _MIN_LINES:
-                raise MethodError(f"Ten lines across the pocket must fit one circle; {lines} do.")
+                raise MethodError(
+                    f"Ten lines across the pocket must fit one circle; {lines} do.", code="scan.pocket.not_round"
+                )
             self.sight = _sight(p)
             solution = least_squares(self._residuals, p / _UNIT, jac=self._jacobian, args=(used,), method="lm")
             p, fitted = solution.x * _UNIT, used
@@ -355,7 +360,8 @@ class _Fit:
             raise MethodError(
                 f"The scans of the pocket do not determine {', '.join(unknown)} of the profiler's pose. The angle a "
                 "needs scans at two heights of the spindle, some millimetres apart, or an angle_prior, such as "
-                "0.005 rad."
+                "0.005 rad.",
+                code="scan.pocket.undetermined",
             )
         covariance[3:, 3:] += np.diag(np.asarray(self.pocket.centre_uncertainty, dtype=float) ** 2)
         return covariance

@@ -88,7 +88,8 @@ def tilt(x: Array, height: Array) -> Tilt:
         if full.sum() < 3:
             raise MethodError(
                 f"The tilt needs three lines with 100 points on the plane; found {int(full.sum())} of {len(height)} "
-                "lines. Check the unit of the heights and that the plane lies in the measuring range."
+                "lines. Check the unit of the heights and that the plane lies in the measuring range.",
+                code="scan.pocket.plane_missing",
             )
         z = np.where(used, height, 0.0)
         mean_x, mean_z = (used @ x) / np.maximum(n, 1), z.sum(axis=1) / np.maximum(n, 1)
@@ -127,7 +128,8 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     if high - low < 0.2e-3 or inside.sum() < 10:
         raise MethodError(
             f"Expected a circular pocket at least 0.2 mm deep, with ten lines across it; found levels {low * 1e3:.4g} "
-            f"and {high * 1e3:.4g} mm, and {int(inside.sum())} lines. Check the unit and that the pocket was scanned."
+            f"and {high * 1e3:.4g} mm, and {int(inside.sum())} lines. Check the unit and that the pocket was scanned.",
+            code="scan.pocket.not_round",
         )
     trim = max(round(TRIM / pitch), 3)
     first, last = np.argmax(deep, axis=1), x.size - 1 - np.argmax(deep[:, ::-1], axis=1)
@@ -146,7 +148,8 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     if line.size < 10:
         raise MethodError(
             f"Expected ten lines with both edges of the pocket; found {line.size}. Too many readings are missing at "
-            "the edges, or the pocket is not completely in the scan."
+            "the edges, or the pocket is not completely in the scan.",
+            code="scan.pocket.edges_missing",
         )
     floor = (index > first[lines, None] + trim) & (index < last[lines, None] - trim)
     depth = -float(np.nanmedian(np.where(floor, step, np.nan)))

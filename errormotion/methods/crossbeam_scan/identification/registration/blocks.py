@@ -155,13 +155,15 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike, scans: int = 1) -> Bl
     if z.ndim != 2 or z.shape != (y.size, x.size):
         raise MethodError(
             f"expected heights of shape (rows, columns) = ({y.size}, {x.size}) by y and x, found {z.shape}; "
-            "give z[row, column] with one y for every profile and one x for every point of a profile"
+            "give z[row, column] with one y for every profile and one x for every point of a profile",
+            code="registration.heights.shape",
         )
     rows, columns = z.shape[0] // ROWS, z.shape[1] // COLUMNS
     if min(rows, columns) < MIN_BLOCKS:
         raise MethodError(
             f"expected at least {MIN_BLOCKS * ROWS} profiles of {MIN_BLOCKS * COLUMNS} points, found "
-            f"{z.shape[0]} of {z.shape[1]}; scan a longer piece of the artefact"
+            f"{z.shape[0]} of {z.shape[1]}; scan a longer piece of the artefact",
+            code="registration.scan.too_small",
         )
     xc, dx = _centres("x", x, columns, COLUMNS, 0.01)
     yc, dy = _centres("y", y, rows, ROWS, 1.0)
@@ -169,7 +171,8 @@ def prepare(height: ArrayLike, x: ArrayLike, y: ArrayLike, scans: int = 1) -> Bl
     if scales.size < MIN_BLOCKS:
         raise MethodError(
             f"expected a surface, found heights in {np.isfinite(z).mean():.1%} of the points and nowhere "
-            f"{FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure"
+            f"{FEWEST} of {POINTS} neighbours together; check the sensor's range and exposure",
+            code="registration.heights.missing",
         )
     # A scan without any noise still has the last bit of its numbers; some of them give its size.
     least = float(np.spacing(np.nanmax(np.abs(z[:: 4 * ROWS - 1, :: COLUMNS - 1]))))
@@ -186,12 +189,14 @@ def _centres(name: str, positions: Array, blocks: int, size: int, tolerance: flo
         raise MethodError(
             f"expected {name} to rise from point to point, found {positions[wrong]:.9g} m followed by "
             f"{positions[wrong + 1]:.9g} m at index {wrong + 1}; check the encoder's count (overflow, reversal) and "
-            "sort or cut the scan"
+            "sort or cut the scan",
+            code="registration.positions.order",
         )
     if positions[-1] - positions[0] > LARGEST:
         raise MethodError(
             f"expected {name} in metres over less than {LARGEST:g} m, found {positions[-1] - positions[0]:.6g} m; "
-            "if these are millimetres, divide by 1000"
+            "if these are millimetres, divide by 1000",
+            code="registration.positions.unit",
         )
     used = positions[: blocks * size]
     pitch = (used[-1] - used[0]) / (used.size - 1)
@@ -201,7 +206,8 @@ def _centres(name: str, positions: Array, blocks: int, size: int, tolerance: flo
     if uneven > tolerance * pitch:
         raise MethodError(
             f"expected {name} evenly spaced within {tolerance:g} of the pitch {pitch * 1e6:.3f} um, found "
-            f"{uneven * 1e6:.3f} um; check the trigger for lost pulses, or resample the scan"
+            f"{uneven * 1e6:.3f} um; check the trigger for lost pulses, or resample the scan",
+            code="registration.positions.uneven",
         )
     centres = even[0] + pitch * (np.arange(blocks) * size + (size - 1) / 2)
     return centres, used.reshape(blocks, size) - centres[:, None]
@@ -218,7 +224,8 @@ def _deblurred(
     if np.count_nonzero(known) < MIN_BLOCKS:
         raise MethodError(
             "expected a smooth surface, found none: no plane explains the blocks of 16 x 4 points; "
-            "check that heights are in metres and that the scan is of the artefact"
+            "check that heights are in metres and that the scan is of the artefact",
+            code="registration.surface.rough",
         )
     if not known.all():
         out[0], out[1], out[2] = repaired(mean, sx, sy, pitch_x, pitch_y)

@@ -53,7 +53,8 @@ def open3d() -> Any:
     except (ImportError, OSError) as error:
         raise MethodError(
             f"expected Open3D for this registration, found none ({error}); install the extra with "
-            '"pip install \'errormotion[open3d]\'" (Python below 3.13), or choose registration = "height_map"'
+            '"pip install \'errormotion[open3d]\'" (Python below 3.13), or choose registration = "height_map"',
+            code="package.missing",
         ) from error
     return module
 
@@ -146,7 +147,10 @@ def ndt_option(o3d: Any) -> Any:
 def _cloud(o3d: Any, points: ArrayLike) -> Any:
     values = np.asarray(points, dtype=float)
     if values.ndim != 2 or values.shape[1] != 3 or len(values) < 100:
-        raise MethodError(f"expected a cloud of shape (n, 3) with at least 100 points, found {values.shape}")
+        raise MethodError(
+            f"expected a cloud of shape (n, 3) with at least 100 points, found {values.shape}",
+            code="registration.cloud.shape",
+        )
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(values[np.isfinite(values).all(axis=1)]))
 
 
@@ -158,7 +162,8 @@ def _icp(o3d: Any, source: Any, target: Any, start: Array, method: Any) -> Found
     if found.fitness == 0:
         raise MethodError(
             f"expected clouds that lie within {NEAREST * 1e3:g} mm of one another, found none of the points to do so; "
-            "check units and the order of the scans"
+            "check units and the order of the scans",
+            code="registration.clouds.apart",
         )
     return RigidTransform.from_matrix(np.array(found.transformation)), float(found.inlier_rmse), _ICP_STEPS
 

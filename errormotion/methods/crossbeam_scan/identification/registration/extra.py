@@ -76,13 +76,15 @@ class Extra:
         if unknown := sorted(set(requested) - set(BASES)):
             raise MethodError(
                 f"expected extra parameters out of {', '.join(BASES)}, found {', '.join(map(repr, unknown))}; "
-                "leave out or rename what is not in the list"
+                "leave out or rename what is not in the list",
+                code="registration.parameters.unknown",
             )
         if wrong := {name: sigma for name, sigma in requested.items() if not sigma > 0}:
             raise MethodError(
                 f"expected the standard deviation of the prior of every extra parameter as a positive number, found "
                 f"{', '.join(f'{name} = {sigma}' for name, sigma in wrong.items())}; "
-                "give inf for a free one, and leave out what is to be 0"
+                "give inf for a free one, and leave out what is to be 0",
+                code="registration.parameters.prior",
             )
         bases = np.array([BASES[name] for name in requested]).reshape(-1, 3, 3)
         return cls(tuple(requested), bases, np.array([float(sigma) for sigma in requested.values()]))
@@ -147,5 +149,6 @@ class Extra:
             raise MethodError(
                 f"expected extra parameters that the artefact's surface separates from its motion and from "
                 f"one another, found undetermined: {', '.join(names)}; omit some of them, or give the standard "
-                f"deviation of their prior, of at most {WIDE:g}"
+                f"deviation of their prior, of at most {WIDE:g}",
+                code="registration.parameters.undetermined",
             )

@@ -122,5 +122,6 @@ def refuse(found: Freedoms, what: str) -> None:
         raise MethodError(
             f"expected an artefact whose surface determines all six freedoms, found {what} that leaves {k} of them "
             f"undetermined: {names} (condition {found.condition:.2g}; it looks like {_SHAPES.get(k, 'no surface')}); "
-            "use a free-form artefact, or ask for the determined freedoms only"
+            "use a free-form artefact, or ask for the determined freedoms only",
+            code="registration.freedoms.undetermined",
         )

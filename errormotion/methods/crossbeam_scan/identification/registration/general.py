@@ -154,7 +154,8 @@ def _pairs(old: Array, new: Array, surfaces: list[Normals], pose: RigidTransform
         raise MethodError(
             f"expected {MIN_PAIRS} pairs of points or more on the common surface of both clouds, found "
             f"{int(used.sum())}, which leaves {', '.join(DOF)} undetermined; check that both show the same piece, and "
-            "measure more points"
+            "measure more points",
+            code="registration.pairs.too_few",
         )
     J = np.hstack([normal, np.cross(p - middle, normal)])[used]
     tilt = (0.25 * (cold.tilt[q] + warm.tilt[near]))[used]

@@ -91,13 +91,16 @@ def register(
     """
     if registration not in ("height_map", "open3d_plane", "paper"):
         raise MethodError(
-            f"expected registration 'height_map', 'open3d_plane' or 'paper', found {registration!r}; choose one of them"
+            f"expected registration 'height_map', 'open3d_plane' or 'paper', found {registration!r}; choose "
+            "one of them",
+            code="registration.unknown",
         )
     terms = Extra.of(extra)
     if terms.names and registration != "height_map":
         raise MethodError(
             f"expected registration 'height_map' for the extra parameters {', '.join(terms.names)}, found "
-            f"{registration!r}, which determines only the rigid motion; choose one or the other"
+            f"{registration!r}, which determines only the rigid motion; choose one or the other",
+            code="registration.parameters.not_allowed",
         )
     free = _determined(cold, warm, loose, terms)
     started = _start(cold, warm, free)
@@ -188,25 +191,29 @@ def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
     if np.isinf(start.scale):
         raise MethodError(
             f"expected two scans of one position, found the cold one at {_extent(cold)} and the warm one at "
-            f"{_extent(warm)}; start both at the same position, and count positions from the same zero"
+            f"{_extent(warm)}; start both at the same position, and count positions from the same zero",
+            code="registration.scans.apart",
         )
     if not start.scale < noise and not start.scale < MAX_MISFIT * (relief := _relief(cold)):
         raise MethodError(
             f"expected two scans of one artefact moved by at most 2 mm and 0.05 rad, found surfaces that stay "
             f"{start.scale * 1e6:.1f} um apart (relief {relief * 1e6:.0f} um) after registration; "
-            "check that both scans are of the same artefact, start at the same position and have the same units"
+            "check that both scans are of the same artefact, start at the same position and have the same units",
+            code="registration.scans.other_surface",
         )
     pose = start.state.pose
     shift, turn = np.hypot(*(pose.apply(cold.centre) - cold.centre)[:2]), start.state.turn
     if shift > MAX_SHIFT or turn > MAX_TURN:
         raise MethodError(
             f"expected a motion of at most 2 mm and 0.05 rad, found {shift * 1e3:.2f} mm across and "
-            f"{turn:.3f} rad; start both scans at the same position of the artefact"
+            f"{turn:.3f} rad; start both scans at the same position of the artefact",
+            code="registration.motion.too_large",
         )
     if start.overlap < MIN_OVERLAP:
         raise MethodError(
             f"expected at least {MIN_OVERLAP:.0%} of the warm scan to lie on the cold one, found {start.overlap:.0%}"
-            "; scan the same piece of the artefact"
+            "; scan the same piece of the artefact",
+            code="registration.overlap.too_small",
         )
     return start
 
@@ -253,7 +260,8 @@ def _refined(problem: Problem, start: Start, free: Freedoms, line_effects: bool)
     else:
         raise MethodError(
             f"expected the registration to settle within {_STEPS} steps, found it still {length**0.5:.1f} standard "
-            "deviations from convergence; check both scans for a part that moved"
+            "deviations from convergence; check both scans for a part that moved",
+            code="registration.not_converged",
         )
     return _Found(state, sums, noise, gate, steps)
 
