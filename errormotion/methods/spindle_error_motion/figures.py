@@ -14,6 +14,8 @@ tilt                    the same of the inclination of the axis, rad: ``W_j`` to
 ``synchronous``
     Range of the mean over turns: radial separation of two circles that enclose its polar plot, concentric with its
     least-squares circle. An axial plot has the centre of the chart.
+``synchronous, MZC``, ``MIC``, ``MCC``
+    The same about the centre of the minimum zone, the maximum inscribed, the minimum circumscribed circle: radial only.
 ``asynchronous``
     Largest range of the motion at one angle (a sector) over all turns, without the synchronous part.
 ``total``
@@ -36,6 +38,7 @@ from numpy.typing import NDArray
 from errormotion.arrays import Array
 from errormotion.estimation.extremes import FLAT, POINTED, expanded, of_noisy_values
 from errormotion.methods.spindle_error_motion.averaging import DRAWS, extremes
+from errormotion.methods.spindle_error_motion.circles import CIRCLES, range_about
 from errormotion.methods.spindle_error_motion.layout import Layout
 from errormotion.methods.spindle_error_motion.synchronous import SAMPLE, Synchronous, limits
 from errormotion.methods.spindle_error_motion.turning import TAU, Turning, angles_of, chunks
@@ -139,10 +142,10 @@ def spread_of(
                 place = np.nan_to_num(turning.sense * angle[:SAMPLE])
                 rest = chunk.reading[:, :SAMPLE] - np.array([np.interp(place % TAU, grid, row) for row in table])
                 limit = np.maximum(np.minimum(limits(rest), mean.limit), 4 * mean.step)
-            given = chunk.reading, angle / TAU, turning.sense, turning.turns, limit, by_angle, drift
-            running = [pool.submit(group.update, normal, *given) for group in groups]
-            for each in running:
-                each.result()
+            given = chunk.reading, angle / TAU, turning.sense, turning.turns, limit, by_angle, drift, normal
+            running = [pool.submit(group.update, given) for group in groups]
+            for thread in running:
+                thread.result()
     low, high, rms = (np.concatenate([getattr(group, name) for group in groups]) for name in ("low", "high", "rms"))
     noisy = [np.concatenate([getattr(group, name) for group in groups], axis=1) for name in ("noisy_low", "noisy_high")]
     for each in (low, high, *noisy):
@@ -173,19 +176,29 @@ class _Group:
     def of(cls, weight: Array, noise: Array, number: int) -> _Group:
         """Return curves without samples; ``weight`` is (sector, curve, sensor)."""
         shape = (weight.shape[1], weight.shape[0])
-        extreme = [np.full(each, sign * np.inf) for each in (shape, (DRAWS, *shape)) for sign in (1, -1)]
-        power = np.zeros(shape[0] + 1)
-        return cls(np.ascontiguousarray(weight), noise.copy(), _SEED + number, *extreme, power)
+        draws = (DRAWS, *shape)
+        return cls(
+            weight=np.ascontiguousarray(weight),
+            noise=noise.copy(),
+            seed=_SEED + number,
+            low=np.full(shape, np.inf),
+            high=np.full(shape, -np.inf),
+            noisy_low=np.full(draws, np.inf),
+            noisy_high=np.full(draws, -np.inf),
+            power=np.zeros(shape[0] + 1),
+        )
 
     @property
     def rms(self) -> Array:
         """Root mean square of each curve."""
         return np.asarray(np.sqrt(self.power[:-1] / max(self.power[-1], 1.0)))
 
-    def update(self, normal: Array, *given: Any) -> None:
-        """Follow the samples of a chunk."""
+    def update(self, chunk: Any) -> None:
+        """Follow the samples of a chunk: the arguments of `extremes` up to the weights, and normal numbers."""
+        *given, normal = chunk
         extreme = self.low, self.high, self.noisy_low, self.noisy_high
-        self.seed = extremes(*given, self.weight, self.noise, normal, self.seed, *extreme, self.power)
+        run: Any = extremes
+        self.seed = run(*given, self.weight, self.noise, normal, self.seed, *extreme, self.power)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,13 +258,20 @@ def figures_of(
         shared = np.einsum("pd,spd->sp", curve.weight, influence)
         single = np.sqrt(np.maximum(np.einsum("pd,pde,pe->p", curve.weight, own, curve.weight), 0.0))
         wanted = [("synchronous " + curve.name, partial(range_of, angle=angle, axial=curve.axial))]
+        if curve.name.startswith("radial"):
+            wanted += [
+                (f"synchronous {curve.name}, {circle}", partial(range_about, angle=angle, circle=circle))
+                for circle in CIRCLES
+            ]
         if curve.axial:
             wanted += [
                 ("fundamental axial", partial(fundamental, angle=angle)),
                 ("residual synchronous axial", partial(range_of, angle=angle, axial=False)),
             ]
         for name, function in wanted:
-            found = of_noisy_values(function, values, single, shared, draws=_DRAWS)
+            found = of_noisy_values(
+                function, values, single, shared, draws=_DRAWS // (2 if name[-3:] in CIRCLES else 1)
+            )
             effect = function(values + shared) - function(values)
             add(name, curve.unit, float(found.value), float(found.bias), float(found.u), effect)
         # What scales with the gain of a sensor

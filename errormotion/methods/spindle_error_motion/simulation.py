@@ -7,6 +7,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.kinematics.iso import DOF, direction_of
+from errormotion.methods.spindle_error_motion.circles import CIRCLES, range_about
 from errormotion.methods.spindle_error_motion.figures import centred, curves_of, fundamental, range_of
 from errormotion.methods.spindle_error_motion.layout import Layout
 from errormotion.methods.spindle_error_motion.model import FORM, PEAKS
@@ -168,6 +169,8 @@ def truth_of(errors: xr.Dataset, settings: Settings, spindle: Spindle, raw: xr.D
     ):
         smooth = np.sum(its.weight * fine, axis=1)
         values[f"synchronous {curve.name}"] = float(range_of(smooth, grid, axial=curve.axial))
+        for circle in CIRCLES:
+            values[f"synchronous {curve.name}, {circle}"] = float(range_about(smooth, grid, circle))
         if curve.axial:
             values["fundamental axial"] = float(fundamental(smooth, grid))
             values["residual synchronous axial"] = float(range_of(smooth, grid, axial=False))

@@ -31,11 +31,14 @@ from errormotion.report.text import fixed, integer, listed
 KEY = (
     "synchronous radial, rotating",
     "asynchronous radial, rotating",
-    "synchronous radial, fixed*",
+    "synchronous radial, fixed ?",
     "synchronous axial",
     "synchronous tilt, rotating",
 )
 MEANINGS = {
+    "synchronous *, MZC": "about the centre of the minimum zone circles",
+    "synchronous *, MIC": "about the centre of the maximum inscribed circle",
+    "synchronous *, MCC": "about the centre of the minimum circumscribed circle",
     "synchronous *": "range of the mean over turns",
     "asynchronous *": "largest range at one angle over all turns",
     "total *": "range of all turns",
