@@ -20,6 +20,8 @@ tilt                    the same of the inclination of the axis, rad: ``W_j`` to
     Largest range of the motion at one angle (a sector) over all turns, without the synchronous part.
 ``total``
     The same as the synchronous value, of the whole plot of all turns.
+``structural``
+    Range of the motion with the spindle at rest, if such a record is stated.
 ``fundamental axial``, ``residual synchronous axial``
     Range of what occurs once a turn, and of the remaining synchronous motion.
 """
@@ -47,6 +49,8 @@ _TABLE = 4096
 _SEED = 230
 _NORMAL = 1 << 16
 _DRAWS = 200
+FEWEST_AT_REST = 20
+"""Readings at rest from which a range follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +231,7 @@ def figures_of(
     spread: Spread,
     gain: tuple[float, NDArray[np.bool_]],
     scatter: NDArray[np.bool_],
+    structural: list[tuple[str, str, Array]],
 ) -> Figures:
     """Return all values.
 
@@ -242,6 +247,8 @@ def figures_of(
         Relative standard uncertainty of the gain of each sensor, and which sources are gains.
     scatter : ndarray of bool, (source,)
         Sources that the mean over turns does not share with the whole motion: its error is in their difference.
+    structural : list
+        Of `structural_of`.
     """
     names, units = list[str](), list[str]()
     parts: list[tuple[float, float, float]] = []
@@ -296,8 +303,35 @@ def figures_of(
         effect = moved[:, top] - moved[:, bottom]
         u = float(np.sqrt(u**2 + float(effect @ effect) + (scale * (value - np.ptp(whole))) ** 2))
         add("total " + curve.name, curve.unit, value, bias, u, effect)
+    for name, unit, (value, bias, u) in structural:
+        add(name, unit, value, bias, float(np.hypot(u, value * gain[0])), value * of_gain)
     value, bias, u = np.array(parts).T
     return Figures(names, units, value, bias, u, np.array(effects).T)
+
+
+def structural_of(raw: xr.Dataset, layout: Layout, curves: list[Curve], noise: float) -> list[tuple[str, str, Array]]:
+    """Return the structural error motion in the fixed directions and along the axis: name, unit, value, bias and u.
+
+    The range of the motion with the spindle at rest, without a line in time. ``noise`` is that of the sensors.
+    """
+    reading = raw["standstill"].transpose("rest", "sensor").values.astype(float)
+    reading = reading[np.isfinite(reading).all(axis=1)]
+    if len(reading) < FEWEST_AT_REST:
+        return []
+    step = np.linspace(-1, 1, len(reading))
+    reading = reading - reading.mean(axis=0)
+    reading -= np.multiply.outer(step, step @ reading / (step @ step))
+    generator, found = np.random.default_rng(_SEED), []
+    for curve in curves:
+        if "rotating" in curve.name:
+            continue
+        weight = curve.weight[0] @ layout.solver
+        motion, size = reading @ weight, noise * float(np.linalg.norm(weight))
+        again = [np.ptp(motion + size * generator.standard_normal(motion.size)) for _ in range(DRAWS)]
+        value = float(np.ptp(motion))
+        values = np.array([value, *_by_noise(value, float(np.mean(again)), size)])
+        found.append((f"structural {curve.name}", curve.unit, values))
+    return found
 
 
 def _by_noise(value: float, noisy: float, noise: float) -> tuple[float, float]:

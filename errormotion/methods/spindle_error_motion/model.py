@@ -12,7 +12,14 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.measurement import Block, Constant, Datum, Noise, Observed, Places, Problem
-from errormotion.methods.spindle_error_motion.figures import Curve, centred, curves_of, figures_of, spread_of
+from errormotion.methods.spindle_error_motion.figures import (
+    Curve,
+    centred,
+    curves_of,
+    figures_of,
+    spread_of,
+    structural_of,
+)
 from errormotion.methods.spindle_error_motion.layout import Layout
 from errormotion.methods.spindle_error_motion.schema import ASSUMED_POSITION, ASSUMED_ROUNDNESS
 from errormotion.methods.spindle_error_motion.synchronous import Synchronous, synchronous_of
@@ -276,6 +283,7 @@ def _finished(solved: Solved, *, record: Record) -> Solved:
         spread,
         (float(record.raw["gain_uncertainty"]), gains),
         scatter,
+        [] if "standstill" not in record.raw else structural_of(record.raw, record.layout, curves, noise),
     )
     names = [curve.name for curve in curves]
     mean = np.array([centred(np.sum(curve.weight * value, axis=1), angle, axial=curve.axial) for curve in curves])

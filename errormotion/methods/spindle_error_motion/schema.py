@@ -77,6 +77,13 @@ RAW_SCHEMAS = (
             ),
             _optional("angle", ("time",), "rad", -NO_LIMIT, NO_LIMIT, "of the spindle, by an encoder, in its sense"),
             _optional(
+                "standstill",
+                ("rest", "sensor"),
+                "m",
+                *READING,
+                "readings with the spindle at rest and the machine switched on, for the structural error motion",
+            ),
+            _optional(
                 "position_uncertainty",
                 (),
                 "m",

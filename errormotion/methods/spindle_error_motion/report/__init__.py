@@ -42,6 +42,7 @@ MEANINGS = {
     "synchronous *": "range of the mean over turns",
     "asynchronous *": "largest range at one angle over all turns",
     "total *": "range of all turns",
+    "structural *": "range with the spindle at rest",
     "fundamental axial": "range of what occurs once a turn",
     "residual synchronous axial": "range of the other synchronous motion",
 }
