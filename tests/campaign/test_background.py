@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from coded import raises
 from command_line import CliRunner
 
 from errormotion.campaign import runner
@@ -68,7 +69,7 @@ def test_a_request_waits_for_its_answer(tmp_path: Path) -> None:
             processes.Request(1, "Mount <b>the bar</b>."),
             60.0,
         )
-        with pytest.raises(RunError, match="is no longer open"):
+        with raises("process.request.closed"):
             processes.answer(tmp_path, NAME, 2)
         assert asking.is_alive()
         listed = CliRunner().invoke(app, ["background", "list", str(tmp_path)])
@@ -120,7 +121,7 @@ def test_pipes_and_links_in_a_foreign_folder_neither_block_nor_are_written_throu
         processes._start(tmp_path, plan('name = "a"'), [], [], released)
     assert not target.exists()
     target.mkdir()
-    with pytest.raises(RunError, match="found a link"):
+    with raises("runs.folder.link"):
         processes._start(tmp_path, plan('name = "a"'), [], [], released)
     assert list(target.iterdir()) == []
 
@@ -145,7 +146,7 @@ def test_a_forged_state_stops_no_other_program(tmp_path: Path, began: object, wo
             start = signals.started(process.pid) if began == "own" else began
             forged = {"campaign": "a", "machine": "m", "started": "", "pid": process.pid, "began": start}
             (folder / "process.json").write_text(json.dumps(forged))
-            with pytest.raises(RunError, match="Nothing was stopped"):
+            with raises("process.record.unreadable"):
                 processes.stop(tmp_path, NAME)
             assert process.poll() is None
         assert not (folder / "stop").exists()
@@ -161,7 +162,7 @@ def test_a_number_of_no_such_process_gets_no_signal(
     with living(tmp_path) as folder:
         forged = {"campaign": "a", "machine": "m", "started": "", "pid": pid, "began": signals.started(1)}
         (folder / "process.json").write_text(json.dumps(forged))
-        with pytest.raises(RunError, match="Nothing was stopped"):
+        with raises("process.record.unreadable"):
             processes.stop(tmp_path, NAME)
     assert not sent
 
@@ -195,7 +196,7 @@ def test_the_command_of_a_started_process_is_the_one_that_a_stop_looks_for(
 
 @pytest.mark.parametrize("name", ["", "..", "../..", "20260101T000000Z-0000000g", "20260101T000000Z-00000001"])
 def test_an_invalid_name_is_an_error(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RunError, match="no process"):
+    with raises("process.not_found"):
         processes.stop(tmp_path, name)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from distributed import LocalCluster
 
 from errormotion import datasets, parallel, plugins
@@ -138,7 +139,7 @@ def test_a_later_worker_with_another_version_rejects_its_task(
 
 def test_a_missing_cluster_is_reported(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 0.3)
-    with pytest.raises(RunError, match="none answers"):
+    with raises("scheduler.no_answer"):
         identify(scheduler="tcp://127.0.0.1:9")
 
 
@@ -146,7 +147,7 @@ def test_cluster_without_workers_is_reported(identify: Identify, monkeypatch: py
     monkeypatch.setattr(parallel, "CLUSTER_TIMEOUT", 2.0)
     with (
         local_cluster(0) as empty,
-        pytest.raises(RunError, match="has no workers; start some with 'dask worker"),
+        raises("scheduler.no_workers"),
     ):
         identify(scheduler=str(empty.scheduler_address))
 
@@ -254,16 +255,16 @@ def test_a_folder_of_runs_selects_those_of_the_method(plan: Callable[..., Campai
 def test_errors_are_reported_before_any_action(raws: list[Path], identify: Identify, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="found 'thread'"):
         identify(scheduler="thread")
-    with pytest.raises(RunError, match="--workers: expected 1 or more"):
+    with raises("scheduler.workers.count"):
         identify(scheduler="threads", workers=0)
-    with pytest.raises(RunError, match="no number for a cluster"):
+    with raises("scheduler.workers.count"):
         identify(scheduler="tcp://127.0.0.1:9", workers=2)
-    with pytest.raises(RunError, match="at least one raw dataset"):
+    with raises("batch.no_datasets"):
         identify_runs([], "spindle_drift", settings(), tmp_path, scheduler="sync")
     with pytest.raises(PluginError, match="Did you mean 'spindle_drift'"):
         identify_runs(raws, "spindel_drift", settings(), tmp_path, scheduler="sync")
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(RunError, match="expected a folder"):
+    with raises("folder.not_created"):
         identify()
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coded import raises
 
 from errormotion import plugins
 from errormotion.campaign.bench import OpenBench
@@ -93,6 +94,6 @@ def test_the_operator_is_prompted_for_real_instruments_only(bench: Callable[...,
     assert asked == ["Mount the bar."]
     with (
         OpenBench(bench("simulated = false")) as table,
-        pytest.raises(BenchError, match="Run the command in a terminal"),
+        raises("operator.request.not_shown"),
     ):
         table.ask("Mount the bar.")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import real_bench
+from coded import raises
 
 from errormotion.campaign import claims, runner
 from errormotion.campaign.addresses import same_device
@@ -397,7 +398,7 @@ def test_the_second_of_two_runs_on_one_bench_creates_nothing(tmp_path: Path, add
             with pytest.raises(RunError) as found:
                 runner.run(plan, runs=tmp_path / "second", release=released)
             refused.append(str(found.value))
-            with pytest.raises(RunError, match="in use"):
+            with raises("claim.instrument.used"):
                 processes.start(plan.source, tmp_path / "third", released)
             raise KeyboardInterrupt
 
@@ -441,7 +442,7 @@ def test_a_folder_whose_files_cannot_be_locked_is_replaced_with_a_note(
         found = holder(MILL)
         assert found is not None
         assert found.what == "a run"
-        with pytest.raises(RunError, match="in use by another program"), claimed(MILL, "a second run"):
+        with raises("claim.instrument.used"), claimed(MILL, "a second run"):
             pass
     refused.append(claims.state_folder() / "claims")
     refused += [tmp_path / "first", tmp_path / "second"]

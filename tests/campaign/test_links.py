@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from coded import raises
 
 from errormotion.campaign import runner
 from errormotion.campaign.files import CampaignPlan
@@ -110,7 +111,7 @@ def test_a_report_contains_nothing_that_lies_outside_of_the_run(unfinished, home
     assert done.errors is not None
     shutil.move(done.errors, tmp_path / "errors.nc")
     put(done, done.data["errors"], tmp_path / "errors.nc")
-    with pytest.raises(RunError, match="contains no errors"):
+    with raises("run.no_errors"):
         write_run_report(done.path)
 
 

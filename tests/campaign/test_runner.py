@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets, plugins
 from errormotion.campaign import runner
@@ -202,7 +203,7 @@ def test_changed_files_are_not_resumed(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="failed"):
         runner.run(plan(f'name = "a"\n{setting}'))
     changed = plan(f'name = "a"\n# another text\n{setting}')
-    with pytest.raises(RunError, match=r"has changed since .* was measured\. Continue with the stored files"):
+    with raises("campaign.changed"):
         runner.resume(changed)
     (tmp_path / "needed").touch()
     (folder,) = runner.resume(runs=tmp_path / "runs")
@@ -222,7 +223,7 @@ def test_two_processes_cannot_work_on_one_run(plan: Plan, tmp_path: Path) -> Non
     with pytest.raises(RunError, match="failed"):
         runner.run(plan(f'name = "a"\nsettings = {{needs_file = "{tmp_path / "needed"}"}}'))
     (folder,) = list_runs(tmp_path / "runs")
-    with folder.locked(), pytest.raises(RunError, match="another process is using this run"):
+    with folder.locked(), raises("run.folder.used"):
         runner.resume(runs=tmp_path / "runs")
 
 
@@ -282,7 +283,7 @@ class Nobody(runner.Quiet):
         self.announced: list[str] = []
 
     def test(self, name: str, folder: Path, number: int, total: int) -> None:
-        with pytest.raises(RunError, match="another process is using this run"):
+        with raises("run.folder.used"):
             runner.resume(runs=self.runs)
         self.refused.append(name)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 
 from errormotion import datasets
 from errormotion.campaign.storage import column as column_module
@@ -380,8 +381,8 @@ def test_damaged_metadata_are_an_error_and_never_an_empty_store(tmp_path):
     )
     for text in damaged:
         file.write_text(text)
-        with pytest.raises(RunError, match="is damaged; restore it from a copy"):
+        with raises("run.file.damaged"):
             committed_length(path, "time")
     file.unlink()
-    with pytest.raises(RunError, match="cannot be read"):
+    with raises("run.file.unreadable"):
         committed_length(path, "time")

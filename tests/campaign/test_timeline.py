@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets
 from errormotion.campaign import runner
@@ -110,7 +111,7 @@ def test_a_schedule_that_contradicts_the_timeline_is_refused(write: Write) -> No
 
 def test_a_run_without_timeline_states_no_truth(write: Write) -> None:
     (folder,) = run(write(drift("drift"), timeline=""))
-    with pytest.raises(RunError, match=r"expected a run of a campaign on a virtual machine with a table \[timeline\]"):
+    with raises("truth.no_timeline"):
         truth_of(folder)
 
 

@@ -5,11 +5,11 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy import stats
 from scipy.optimize import minimize
 
 from errormotion.arrays import Array
-from errormotion.errors import FitError
 from errormotion.estimation.blocks import Block, Constant, Noise
 from errormotion.estimation.components import NOISE, components, noise_variance
 from errormotion.estimation.fit import fit
@@ -241,7 +241,7 @@ def test_an_unknown_noise_does_not_change_the_uncertainty_of_a_constant() -> Non
     factor, freedom = noise_variance(found)
     assert factor == pytest.approx(y.var(ddof=1), rel=1e-8)
     assert freedom == pytest.approx(19)
-    with pytest.raises(FitError, match="unknown of the fit"):
+    with raises("estimation.noise.not_unknown"):
         variance_factor(found.chi2, found.freedom, stated=False, priors=True)
     scatter = variance_factor(
         found.chi2, found.freedom, stated=False, priors=True, estimate=lambda: noise_variance(found)
@@ -255,7 +255,7 @@ def test_an_unknown_noise_does_not_change_the_uncertainty_of_a_constant() -> Non
 
 def test_effects_that_are_not_separated_from_fixed_ones_are_refused() -> None:
     problem = one_way(np.random.default_rng(7).standard_normal((1, 1)))
-    with pytest.raises(FitError, match="no redundancy"):
+    with raises("estimation.no_redundancy"):
         components(problem)
 
 

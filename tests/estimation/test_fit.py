@@ -8,6 +8,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.optimize import least_squares
 
 from errormotion.arrays import Array
@@ -374,7 +375,7 @@ def test_a_fit_that_starts_at_its_solution_has_the_same_solution() -> None:
 
 
 def test_a_prior_of_zero_is_refused() -> None:
-    with pytest.raises(FitError, match="above 0"):
+    with raises("estimation.prior.not_positive"):
         straight(np.linspace(0, 1, 7), np.zeros(7), prior=np.array([1.0, 0.0]))
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.interpolate import make_smoothing_spline
 
-from errormotion.errors import MethodError
 from errormotion.estimation.smoothing import smooth, smooth_vectors
 
 PLACES = 0.35 + 0.2 * np.arange(8)
@@ -177,15 +177,15 @@ def test_unknown_component_affects_no_other():
 def test_wrong_inputs_are_refused():
     x = PLACES
     y, v = np.ones((2, 8)), np.full((2, 8), 1e-6)
-    with pytest.raises(MethodError, match=r"positions \(n,\)"):
+    with raises("smoothing.shape"):
         smooth(x[:5], y, v, x)
-    with pytest.raises(MethodError, match="above 0"):
+    with raises("smoothing.variance.not_positive"):
         smooth(x, y, 0 * v, x)
-    with pytest.raises(MethodError, match="order 1, 2 or 3"):
+    with raises("smoothing.order"):
         smooth(x, y, v, x, order=4)
-    with pytest.raises(MethodError, match="finite"):
+    with raises("smoothing.position.not_finite"):
         smooth(np.where(x > 1, np.nan, x), y, v, x)
-    with pytest.raises(MethodError, match="positions above 0"):
+    with raises("smoothing.position.not_positive"):
         smooth(x - x[0], y, v, x, exact_zero=True)
-    with pytest.raises(MethodError, match=r"\(\.\.\., n, d\)"):
+    with raises("smoothing.shape"):
         smooth_vectors(x, y, v, x)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 
 from errormotion.datasets import provenance
-from errormotion.errors import MethodError
 from errormotion.measurement.identification import dataset, solve
 from tests.measurement.test_model import Drift, DriftSettings
 from tests.measurement.test_solution import POSITION, SLOPE, N, observed
@@ -53,7 +53,7 @@ def test_unrounded_readings_have_no_step_and_small_steps_change_nothing() -> Non
 def test_readings_without_scatter_and_without_a_step_are_refused() -> None:
     raw, _, settings = rounded(1, 0.01e-6, STEP, stated=False)
     raw["reading"] = raw["reading"] * 0 + 3e-6
-    with pytest.raises(MethodError, match="State their noise, or the resolution"):
+    with raises("readings.noise.unknown"):
         METHOD.identify(raw, settings)
 
 

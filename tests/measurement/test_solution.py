@@ -6,6 +6,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
@@ -155,7 +156,7 @@ def test_an_outlier_and_a_step_are_named_and_repaired() -> None:
 def test_an_unknown_noise_without_redundancy_is_refused() -> None:
     y = np.full(N, np.nan)
     y[3] = 1e-6
-    with pytest.raises(MethodError, match=r"(?i)no redundancy"):
+    with raises("estimation.no_redundancy"):
         solve(observed(y, None))
 
 

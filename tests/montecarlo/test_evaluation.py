@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 from numpy.random import SeedSequence
 from typer.testing import CliRunner
 
@@ -215,7 +216,7 @@ def test_a_method_without_redrawing_is_refused(measured):
     class Plain(Method):
         info = method.info
 
-    with pytest.raises(MethodError, match="has no 'redrawing'"):
+    with raises("monte_carlo.method.no_redrawing"):
         trials.redrawing_of(Plain(), None, settings, errors)
 
 
@@ -228,7 +229,7 @@ def test_reduced_data_with_other_values_are_a_defect(measured):
             scaled = raw.assign(reading=raw["reading"] + 1e-5)
             return Redrawing(scaled, settings, {})
 
-    with pytest.raises(MethodError, match="defect of the redrawing of the method"):
+    with raises("monte_carlo.redrawing.values"):
         trials.redrawing_of(Shifted(), raw, settings, errors)
 
 
