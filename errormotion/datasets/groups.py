@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 GROUPS = {
     "alignment": "angle between the measured line and the axis",
+    "asynchronous motion and noise": "scatter of the mean over turns of a spindle, by all that is not synchronous",
     "axis average line": "position and direction of the axis average line, to which the errors refer",
     "bar radius": "radius of the bar in the spindle",
     "beam calibration": "calibrated origins and directions of the beams of point sensors",
@@ -24,9 +25,11 @@ GROUPS = {
     "drift": "motion of the stations of a tracker during the measurement",
     "drift from run to run": "motion between the instrument and the axis from one run to the next",
     "drift of the bar": "change of the length of a ballbar during the measurement",
+    "eccentricity": "position of an artefact in the spindle, which is removed from the motion",
     "ends of the reference line": "readings at the ends of the line to which straightness refers",
     "errors of the axes": "errors of the axes from which the errors in a volume are computed",
     "expansion coefficient of the bar": "coefficient of expansion of a ballbar",
+    "form of the artefact": "deviations of an artefact in the spindle from a circle",
     "frame expansion": "coefficients of expansion of the frame that holds point sensors",
     "frame temperature": "temperature of the frame that holds point sensors",
     "gain of the instrument": "gain of the instrument that reads an error other than a length",
@@ -36,6 +39,7 @@ GROUPS = {
     "misfit": "errors that a thermal model does not represent",
     "nominal beams": "deviations of beams that were not calibrated from their nominal origins and directions",
     "offsets of spheres": "positions of spheres as set up, where they are unknown",
+    "position of sensors": "positions of sensors along the axis of a spindle",
     "position of spheres": "stated positions of spheres",
     "profiler pose": "position and orientation of a line profiler on its carriage",
     "radius of the sphere": "radius of the sphere in the spindle",

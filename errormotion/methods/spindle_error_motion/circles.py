@@ -52,7 +52,7 @@ def _exchanged(columns: Array, right: Array, cost: Array, start: Array) -> Array
     By the simplex method on the dual: max cost . w with columns w = right and w >= 0.
     """
     plots = np.arange(len(cost))
-    basis = np.tile(start, (len(cost), 1))
+    basis = np.tile(start, (len(cost), 1)).astype(np.intp)
     level = _LEVEL * np.maximum(np.ptp(cost, axis=1), 1e-300)
     y = np.zeros((len(cost), len(right)))
     for _ in range(_EXCHANGES):
