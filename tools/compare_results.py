@@ -22,7 +22,8 @@ same. The exit code is 1 if anything differs, or if an item is in only one folde
 
 With ``--within``, a difference is divided by the standard uncertainty: from ``covariance`` (EX to EC, ``covariance``,
 ``influence``), from ``NAME_uncertainty`` or ``NAME_covariance`` (other variables), or, without a stated one, by the
-largest absolute value of the variable. Integers, truth values, texts and the pattern of NaN must always be equal.
+largest absolute value of the variable. ``--by-group`` compares the effects of all sources of a group together, for
+versions that have them as other sources. Integers, truth values, texts and the pattern of NaN must always be equal.
 Earlier names of groups of sources equal the present ones.
 """
 
@@ -276,8 +277,8 @@ def digests_of(ds: xr.Dataset) -> dict[str, str]:
 class Difference:
     """Differences of two datasets, omitted attributes, and the largest difference in standard uncertainties."""
 
-    def __init__(self, within: float | None, ignore: tuple[str, ...], wording: bool) -> None:
-        self.within, self.ignore, self.wording = within, ignore, wording
+    def __init__(self, within: float | None, ignore: tuple[str, ...], wording: bool, by_group: bool = False) -> None:
+        self.within, self.ignore, self.wording, self.by_group = within, ignore, wording, by_group
         self.found: list[str] = []
         self.left_out: Counter[str] = Counter()
         self.reworded: list[str] = []
@@ -312,6 +313,10 @@ class Difference:
 
     def _variable(self, name: str, old: xr.Dataset, new: xr.Dataset) -> None:
         a, b = old.variables[name], new.variables[name]
+        if self.by_group and "source" in a.dims and "source" in b.dims:
+            if a.dtype.kind == "f":
+                self._groups(name, old, new)
+            return
         if name == "source_group":
             before, after = ([present_group(str(each)) for each in v.values] for v in (a, b))
             if before != after:
@@ -341,6 +346,22 @@ class Difference:
         if self.within is None or not worst <= self.within:
             self.found.append(f"{name}: {differ.sum()} of {x.size} values differ, at most {worst:.3g} uncertainties")
 
+    def _groups(self, name: str, old: xr.Dataset, new: xr.Dataset) -> None:
+        """Compare the uncertainty by each group of sources, however many these are."""
+        before, after = (by_group(name, ds) for ds in (old, new))
+        total = sum(np.square(u) for u in before.values())
+        scale = np.sqrt(np.where(total > 0, total, np.nanmax(total, initial=0.0)))
+        for group in sorted(set(before) | set(after)):
+            a, b = before.get(group, 0.0 * scale), after.get(group, 0.0 * scale)
+            if np.shape(a) != np.shape(b):
+                self.found.append(f"{name}, {group}: {np.shape(a)} became {np.shape(b)}")
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                worst = float(np.nanmax(np.where(a == b, 0.0, np.abs(b - a) / scale), initial=0.0))
+            self.largest = max(self.largest, worst)
+            if self.within is None or worst > self.within:
+                self.found.append(f"{name}, {group}: differs by at most {worst:.3g} of that of all sources")
+
     def _attributes(self, old: dict[str, Any], new: dict[str, Any]) -> None:
         for path in sorted(set(old) | set(new)):
             if any(fnmatch(path, pattern) for pattern in self.ignore):
@@ -363,6 +384,13 @@ def present_group(name: str) -> str:
     if not GROUPS:
         GROUPS.update(runpy.run_path(str(TABLE_OF_GROUPS))["ALIASES"])
     return GROUPS.get(name, name)
+
+
+def by_group(name: str, ds: xr.Dataset) -> dict[str, Any]:
+    """Return the root sum of squares of the effects of the sources of each group, by its present name."""
+    effects = np.moveaxis(ds.variables[name].values, ds.variables[name].dims.index("source"), 0)
+    groups = np.array([present_group(str(each)) for each in ds.variables["source_group"].values])
+    return {str(group): np.sqrt(np.square(effects[groups == group]).sum(axis=0)) for group in np.unique(groups)}
 
 
 def uncertainty(name: str, ds: xr.Dataset) -> Any:
@@ -427,11 +455,13 @@ def short(value: Any) -> str:
     return text if len(text) <= 100 else f"{text[:97]}..."
 
 
-def compare(old: Path, new: Path, within: float | None, ignore: list[str], wording: bool, details: int) -> int:
+def compare(
+    old: Path, new: Path, within: float | None, ignore: list[str], wording: bool, by_group: bool, details: int
+) -> int:
     """Print one line for each dataset and return 1 if anything differs, else 0."""
     left_out, reworded, different, total = Counter[str](), 0, 0, 0
     print(f"{'dataset':58} {'compared':>8} {'left out':>8} {'reworded':>8} {'max |d|/u':>10}  result")
-    for name, difference in pairs(old, new, Difference, within, (*LEFT_OUT, *ignore), wording):
+    for name, difference in pairs(old, new, Difference, within, (*LEFT_OUT, *ignore), wording, by_group):
         total += 1
         different += bool(difference.found)
         left_out += difference.left_out
@@ -504,6 +534,7 @@ def main() -> int:
     two.add_argument("--within", type=float, help="largest difference, as a fraction of the standard uncertainty")
     two.add_argument("--ignore", action="append", default=[], metavar="PATH", help="attribute to omit, as *.name")
     two.add_argument("--wording", action="store_true", help="accept another wording of notes and descriptions")
+    two.add_argument("--by-group", action="store_true", help="compare sources by their groups, however many they are")
     two.add_argument("--details", type=int, default=5, help="differences to print for one dataset")
     given = parser.parse_args()
     if given.command == "make":
@@ -513,7 +544,7 @@ def main() -> int:
     for folder in (given.old, given.new):
         if not (folder / "digests.json").exists():
             parser.error(f"{folder}: expected a complete folder of 'make'; found no digests.json")
-    return compare(given.old, given.new, given.within, given.ignore, given.wording, given.details)
+    return compare(given.old, given.new, given.within, given.ignore, given.wording, given.by_group, given.details)
 
 
 if __name__ == "__main__":

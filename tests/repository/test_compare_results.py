@@ -54,10 +54,12 @@ def script() -> ModuleType:
     return module
 
 
-def compared(old: Path, new: Path, *, within: float | None = None, wording: bool = False) -> tuple[int, str]:
+def compared(
+    old: Path, new: Path, *, within: float | None = None, wording: bool = False, by_group: bool = False
+) -> tuple[int, str]:
     """Return exit code and output of the comparison."""
     with contextlib.redirect_stdout(io.StringIO()) as text:
-        code = script().compare(old, new, within, [], wording, 5)
+        code = script().compare(old, new, within, [], wording, by_group, 5)
     return code, text.getvalue()
 
 
@@ -136,3 +138,24 @@ def test_a_missing_dataset_and_another_input_are_differences(tmp_path: Path) -> 
     assert compared(old, new)[0] == 0
     (new / "errors" / "one.nc").unlink()
     assert compared(old, new)[0] == 1
+
+
+def sourced(effects: np.ndarray, groups: list[str]) -> xr.Dataset:
+    """Return the dataset with the effects of sources (source, time, dof)."""
+    coords = {"source": [f"source {k}" for k in range(len(groups))], "source_group": ("source", groups)}
+    return errors().assign(influence=(("source", "time", "dof"), effects)).assign_coords(coords)
+
+
+@pytest.mark.parametrize(("factor", "code"), [(1.0, 0), (1.0 + 1e-8, 1)])
+def test_fewer_sources_of_a_group_are_equal_by_group_only(tmp_path: Path, factor: float, code: int) -> None:
+    """Three sources are replaced by two with the same covariance, and one of another group by none of no effect."""
+    rng = np.random.default_rng(2)
+    two = U * rng.normal(size=(2, 4, 6))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0][:, :2]
+    three = np.einsum("ij,jtd->itd", turn, two)
+    before = sourced(np.concatenate([three, np.zeros((1, 4, 6))]), ["drift", "drift", "drift", "scale"])
+    after = sourced(two * factor, ["drift", "drift"])
+    old, new = store(tmp_path / "old", before), store(tmp_path / "new", after)
+    assert compared(old, new, within=1e-9)[0] == 1
+    found, text = compared(old, new, within=1e-9, by_group=True)
+    assert found == code, text
