@@ -108,7 +108,8 @@ def delimiter_of(lines: Sequence[str], missing: Sequence[str] = ()) -> str:
                     len(row) in (width, width - 1, width + 1) and shares[k] < 0.5 for k, row in enumerate(filled)
                 )
                 score *= 1.0 if heads else 0.9
-        if score > best + 1e-9:
+        # Blanks also separate the words of a text and the parts of a date above the table.
+        if score > best + (0.2 if delimiter == " " and best > 0 else 1e-9):
             best, chosen = score, delimiter
     if chosen == "," and _one_column(lines, missing):
         return "|"
@@ -173,19 +174,20 @@ def body_of(rows: Sequence[Line], missing: Sequence[str], header: bool | None, s
         return (
             len(fields) == width
             and all(is_data(fields[k], missing) for k in numeric)
-            and any(fields[k] for k in numeric)
+            and any(fields[k] not in ("", "-") for k in numeric)
         )
 
     def is_damaged(fields: Sequence[str]) -> bool:
         """Whether a line beside the rows is one of them with wrong cells or fields, and no header or text."""
         cells = [fields[k] for k in (numeric if len(fields) == width else range(len(fields))) if fields[k]]
         numbers = [text for text in cells if is_data(text, missing)]
-        if len(fields) < 2 or not numbers or numbers == [str(k) for k in range(1, len(numbers) + 1)]:
+        if not numbers or numbers == [str(k) for k in range(1, len(numbers) + 1)]:
             return False  # also names such as Target, 1, 2, 3
         word = re.sub(r"[^\w]", "", fields[0]).lower()
         if word in _STATISTICS or (0 in numeric and not any(sign.isdigit() for sign in word)):
             return False
-        begins = 0 in numeric and is_data(fields[0], missing)
+        digits = sum(sign.isdigit() for sign in word)
+        begins = 0 in numeric and (is_data(fields[0], missing) or 2 * digits >= len(word))
         return begins or len(fields) != width or 2 * len(numbers) > len(cells)
 
     def is_below_names(above: Sequence[str], fields: Sequence[str]) -> bool:
@@ -220,7 +222,9 @@ def _heads(rows: Sequence[Line], first: int, width: int, slack: int) -> tuple[in
     if not above or above[-1] != first - 1:
         return None, None
     filled = [text for text in rows[first - 1][1] if text]
-    if len(above) > 1 and above[-2] == first - 2 and all(is_unit(text) for text in filled):
+    units = [text for text in filled if text not in ("-", "1")]
+    plain = all(map(is_unit, units)) if units else all(text == "-" for text in filled)
+    if len(above) > 1 and above[-2] == first - 2 and plain:
         return first - 2, first - 1
     return first - 1, None
 

@@ -19,7 +19,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.tables import recognition
 from errormotion.datasets.tables.encoding import decode
 from errormotion.datasets.tables.format import Format
-from errormotion.datasets.tables.numbers import NO_VALUE, signs
+from errormotion.datasets.tables.numbers import NO_VALUE, NUMERIC, signs
 from errormotion.datasets.tables.recognition import Body, Line, body_of, delimiter_of, split
 from errormotion.datasets.tables.table import Cells, Table, named, same
 from errormotion.errors import DatasetError
@@ -184,7 +184,8 @@ def _head(
 def _complete(lines: Sequence[str], rows: Sequence[Line], body: Body, path: Path) -> None:
     """Raise DatasetError if the last number, without an end of its line, has fewer decimals than all others."""
     column = [row[-1] for _, row in rows[body.first : body.last + 1] if len(row) == body.width]
-    decimals = [len(match[1]) if (match := _CUT_OFF.search(text)) else 0 for text in column]
+    numbers = [text for text in column[:-1] if NUMERIC.fullmatch(text)] + column[-1:]
+    decimals = [len(match[1]) if (match := _CUT_OFF.search(text)) else 0 for text in numbers]
     if len(decimals) > 3 and min(decimals[:-1]) > decimals[-1]:
         raise DatasetError(
             f"{path}, line {len(lines)}: the file ends in '{column[-1]}', which has fewer decimals than all numbers "
