@@ -29,6 +29,7 @@ from errormotion.estimation.sources import Errors, errors_of
 from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF
 from errormotion.measurement.noise import (
+    beyond_of,
     estimated_noise,
     fitted,
     has_priors,
@@ -67,6 +68,9 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
         given = observed.problem
         observed = replace(observed, resolution=steps_of(observed))
         observed, found, search = _cleaned(observed if sources else replace(observed, examined=None), start)
+        whole = beyond_of(observed, found)
+        if whole is not observed:
+            observed, found = whole, fitted(whole, whole.problem, found)
         neighbours = neighbours_of(observed, found)
         observed = replace(
             observed,

@@ -19,6 +19,7 @@ from errormotion.estimation.blocks import Noise
 from errormotion.estimation.checks import resolution
 from errormotion.estimation.checks.correlated import autoregressive, correlated
 from errormotion.estimation.checks.resolution import Rounding
+from errormotion.estimation.checks.slow_noise import sentence, slow_noise
 from errormotion.estimation.components import noise_variance
 from errormotion.estimation.derivatives import column
 from errormotion.estimation.fit import Fit, fit
@@ -29,6 +30,7 @@ from errormotion.measurement.observed import Observed
 
 __all__ = [
     "Neighbours",
+    "beyond_of",
     "estimated_noise",
     "fitted",
     "has_priors",
@@ -125,6 +127,30 @@ def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
         else:
             note = f"{what}; the uncertainties contain it."
     return Neighbours(along.phi, along.u_phi, note, doubt)
+
+
+def beyond_of(observed: Observed, found: Fit) -> Observed:
+    """Return a model with the noise of its readings over time that no redundancy shows, and a sentence on it.
+
+    For as many readings as unknowns, with a stated noise, and the time as their order.
+    """
+    problem, order = observed.problem, observed.order
+    if order is None or found.freedom >= 1 or observed.correlation is not None or not problem.noise.stated:
+        return observed
+    known = np.flatnonzero(np.isfinite(order))
+    ranked = known[np.argsort(order[known], kind="stable")]
+    if observed.series is not None or not (np.diff(order[ranked]) > 0).all():
+        return observed
+    readings = column(problem.readings)
+    sd = np.sqrt(np.diagonal(problem.noise.covariance(readings.shape), axis1=1, axis2=2))
+    slow = slow_noise(order[ranked], readings[ranked].T, sd[ranked].T, observed.breaks)
+    if slow is None:
+        return observed
+    factor, unit = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(observed.unit, (1.0, observed.unit))
+    said = sentence(slow, ", ".join(f"{each * factor:.2g} {unit}" for each in slow.sd), observed.what)
+    name = "doubts" if slow.duration > 0 else "notes"
+    larger = scaled(problem, 1.0, np.broadcast_to(slow.sd, readings.shape))
+    return replace(observed, problem=larger, **{name: [*getattr(observed, name), said]})
 
 
 def _of_unknown_noise(observed: Observed, found: Fit) -> Fit:

@@ -76,7 +76,11 @@ class Observed:
         default it is found from the readings.
     order : ndarray, (n,), optional
         Time or position of each reading. With it, noise that is correlated along this order is found and taken into
-        account (`errormotion.estimation.checks.correlated`).
+        account (`errormotion.estimation.checks.correlated`), and where as many readings as unknowns check nothing,
+        noise beyond the stated one by its scatter about smooth curves over time
+        (`errormotion.estimation.checks.slow_noise`).
+    breaks : sequence of float
+        Values of ``order`` at which what is measured may change abruptly; otherwise it is smooth.
     series : ndarray of int, (n,), optional
         The run or the channel of each reading; different ones are independent.
     correlation : float, optional
@@ -143,6 +147,7 @@ class Observed:
     unit: str = "m"
     resolution: float | Array | None = None
     order: Array | None = None
+    breaks: Sequence[float] = ()
     series: Index | None = None
     correlation: float | None = None
     refresh: Callable[[Problem, Any], Problem] | None = None

@@ -267,7 +267,8 @@ class _Trial:
             log = metric.log_likelihood(values)
             without = np.maximum(without, log)
             with_them = np.maximum(with_them, log[:, None] + metric.gains(values, self._index, self._single))
-        return with_them - without[:, None]
+        found: Array = with_them - without[:, None]
+        return found
 
 
 class _Metric:

@@ -1,6 +1,7 @@
 """Readings that are rounded, or whose noise is correlated: intervals still hold the truth, and a note says why."""
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import xarray as xr
 from coded import raises
 
 from errormotion.datasets import provenance
+from errormotion.measurement import Block, Noise, Observed, Places, Problem
 from errormotion.measurement.identification import dataset, solve
 from tests.measurement.test_model import Drift, DriftSettings
 from tests.measurement.test_solution import POSITION, SLOPE, N, observed
@@ -122,3 +124,52 @@ def test_doubts_are_those_of_the_result() -> None:
     unchanged = solve(replace(model, noise_increases=False, robust=False))
     result = dataset(METHOD, unchanged, raw, METHOD.info, provenance.make(settings, raw, None, steps=["test"]))
     assert any("the stated noise is used" in note for note in result.em.doubts)
+
+
+class Levels(NamedTuple):
+    level: Any
+
+
+def curve(further: float, seed: int) -> tuple[Observed, np.ndarray]:
+    """Return three readings for the three errors of each of 60 instants of a warm-up, and the true errors."""
+    n, noise, rng = 60, 3e-9, np.random.default_rng(seed)
+    time = 30.0 * np.arange(n)
+    true = (1 - np.exp(-time / 600.0))[:, None] * np.array([1e-6, 3e-6, 20e-6])
+    e = rng.standard_normal((n, 3))
+    for k in range(1, n):
+        e[k] = 0.8 * e[k - 1] + 0.6 * e[k]
+    index = np.arange(n)
+    problem = Problem(
+        equation=lambda y, x, _: y - x.level,
+        readings=true + noise * (rng.standard_normal((n, 3)) + further * e),
+        unknowns=Levels(Block(start=np.zeros((n, 3)), index=index, scale=1.0, group="level")),
+        noise=Noise(sd=np.full((n, 3), noise)),
+    )
+    model = Observed(
+        problem=problem,
+        places=Places(lambda x, _: x.level, n, rows={"level": index}),
+        freedoms=("EX", "EY", "EZ"),
+        dims=("time",),
+        coords={"time": ("time", time, {"units": "s"})},
+        component="tool",
+        functional_point=(0, 0, 0),
+        reference="none",
+        order=time,
+        robust=False,
+    )
+    return model, true
+
+
+def test_noise_of_readings_that_nothing_checks_is_found_by_their_order() -> None:
+    inside, doubted, false = [], 0, 0
+    for seed in range(20):
+        model, true = curve(2.0, seed)
+        solved = solve(model)
+        errors = solved.relative.errors
+        u = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
+        inside.append(np.abs(errors.value - true) <= 1.96 * u)
+        doubted += any("alike for about" in each for each in solved.observed.doubts)
+        false += any("alike for about" in each for each in solve(curve(0.0, seed)[0]).observed.doubts)
+    assert np.mean(inside) > 0.9
+    assert doubted >= 18
+    assert false <= 3

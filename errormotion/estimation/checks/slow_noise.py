@@ -31,7 +31,7 @@ from scipy.linalg import eigh
 
 from errormotion.arrays import Array
 
-__all__ = ["SlowNoise", "slow_noise"]
+__all__ = ["SlowNoise", "sentence", "slow_noise"]
 
 FEWEST = 16
 """Values of a stretch without which nothing is tested."""
@@ -67,6 +67,18 @@ class SlowNoise:
 
     sd: Array
     duration: float
+
+
+def sentence(found: SlowNoise, sizes: str, what: str = "the readings") -> str:
+    """Return the sentences on further noise, with its ``sizes`` in words; they doubt uncertainties if it is alike."""
+    subject = what[:1].upper() + what[1:]
+    if not found.duration > 0:
+        return f"{subject} scatter about smooth curves by more than their noise ({sizes}); the uncertainty contains it."
+    return (
+        f"{subject} vary about smooth curves by more than their noise ({sizes}), alike for about "
+        f"{found.duration:.2g} s. The uncertainty of each error contains it, that of a mean or a slope over several "
+        "instants does not. A motion that is as fast looks the same."
+    )
 
 
 def slow_noise(time: Array, values: Array, sd: Array, breaks: Sequence[float] = ()) -> SlowNoise | None:

@@ -24,7 +24,7 @@ from errormotion.estimation.checks import resolution
 from errormotion.estimation.checks.aliases import aliases
 from errormotion.estimation.checks.resolution import step_of
 from errormotion.estimation.checks.series import spikes
-from errormotion.estimation.checks.slow_noise import slow_noise
+from errormotion.estimation.checks.slow_noise import sentence, slow_noise
 from errormotion.methods.spindle_drift.identification.averaging import (
     Averager,
     Averages,
@@ -367,16 +367,7 @@ def slow(record: Record, sigma: Array, settings: Settings, notes: list[str], dou
     if found is None:
         return np.zeros(len(CHANNELS))
     sizes = ", ".join(f"{name} {sd * 1e6:.2g} um" for name, sd in zip(CHANNELS, found.sd, strict=True) if sd > 0)
-    if found.duration > 0:
-        doubts.append(
-            f"The readings vary about smooth curves by more than their noise ({sizes}), alike for about "
-            f"{found.duration:.2g} s. The uncertainty of each error contains it, that of a mean or a slope over "
-            "several instants does not. A motion of the spindle that is as fast looks the same."
-        )
-    else:
-        notes.append(
-            f"The readings scatter about smooth curves by more than their noise ({sizes}); the uncertainty contains it."
-        )
+    (doubts if found.duration > 0 else notes).append(sentence(found, sizes))
     return found.sd
 
 
