@@ -148,9 +148,10 @@ def beyond_of(observed: Observed, found: Fit) -> Observed:
         return observed
     factor, unit = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(observed.unit, (1.0, observed.unit))
     said = sentence(slow, ", ".join(f"{each * factor:.2g} {unit}" for each in slow.sd), observed.what)
-    name = "doubts" if slow.duration > 0 else "notes"
-    larger = scaled(problem, 1.0, np.broadcast_to(slow.sd, readings.shape))
-    return replace(observed, problem=larger, **{name: [*getattr(observed, name), said]})
+    larger = replace(observed, problem=scaled(problem, 1.0, np.broadcast_to(slow.sd, readings.shape)))
+    if slow.duration > 0:
+        return replace(larger, doubts=[*observed.doubts, said])
+    return replace(larger, notes=[*observed.notes, said])
 
 
 def _of_unknown_noise(observed: Observed, found: Fit) -> Fit:

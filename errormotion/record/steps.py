@@ -275,7 +275,7 @@ class _Metric:
     """A covariance V of the values, and the directions of candidates in whitened coordinates."""
 
     def __init__(self, X: Array, columns: Array, V: Array, prior: float) -> None:
-        self.L: Array = np.linalg.cholesky(V)
+        self.L: Array = np.asarray(np.linalg.cholesky(V), dtype=float)
         self._inverse = solve_triangular(self.L, np.eye(len(V)), lower=True)
         self._Q, _ = np.linalg.qr(self._inverse @ X)
         Z = self._inverse @ columns

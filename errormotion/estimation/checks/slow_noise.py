@@ -30,6 +30,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from errormotion.arrays import Array
+from errormotion.estimation.blocks import Index
 
 __all__ = ["SlowNoise", "sentence", "slow_noise"]
 
@@ -112,7 +113,7 @@ def slow_noise(time: Array, values: Array, sd: Array, breaks: Sequence[float] = 
     return SlowNoise(found, duration) if found.any() else None
 
 
-def _stretches(time: Array, stretch: Array) -> list[tuple[int, slice]]:
+def _stretches(time: Array, stretch: Index) -> list[tuple[int, slice]]:
     """Return the numbers of values in a mean, with the values of the longest stretch without a break."""
     edges = np.flatnonzero(np.diff(stretch, prepend=-1, append=-1))
     if len(edges) < 2:

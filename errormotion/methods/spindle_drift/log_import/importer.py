@@ -12,7 +12,8 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.tables.mistakes import Mistakes
-from errormotion.datasets.text.log_reader import NOTES, Columns, Place, holes, read_columns
+from errormotion.datasets.tables.table import Place
+from errormotion.datasets.text.log_reader import NOTES, Columns, holes, read_columns
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 from errormotion.methods.spindle_drift.log_import.import_map import (
