@@ -33,9 +33,9 @@ class Path:
     rapid: NDArray[np.bool_]
 
     @classmethod
-    def resting(cls, place: ArrayLike) -> Path:
-        """Return the path of a machine that does not move."""
-        return cls(np.zeros(1), np.array(place, dtype=float).reshape(1, 3), np.zeros(0, dtype=bool))
+    def resting(cls, place: ArrayLike, since: float = 0.0) -> Path:
+        """Return the path of a machine that does not move, from a time on, s."""
+        return cls(np.full(1, float(since)), np.array(place, dtype=float).reshape(1, 3), np.zeros(0, dtype=bool))
 
     @property
     def begin(self) -> float:

@@ -62,6 +62,6 @@ def test_the_reflector_moves_with_the_same_thermal_errors_as_the_probe(here: Vir
     here.follow(HEAT, 7200.0)
     here.move_to([3.5, -0.6, 0.8])
     times = np.array([here.time])
-    scene = TrackerScene(here, parse_address("sim://gantry/tracker?seed=4&thermal=1"), np.random.default_rng(0))
+    scene = TrackerScene(here, parse_address("sim://gantry/tracker?seed=4&thermal=1"))
     place = scene.places(times)[0] - here.position()
     np.testing.assert_allclose(place, here.machine.probe_error(here.position(), times)[0], atol=1e-12)

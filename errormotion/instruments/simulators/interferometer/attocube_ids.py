@@ -136,8 +136,7 @@ class SimulatedIds(SimulatedDevice):
         if direction.shape != (3,) or not np.linalg.norm(direction) > 0.0:
             raise InstrumentError(f"'beam{axis + 1}': expected a direction of three numbers", code="simulator.setting")
         lever = address.params.get(f"lever{axis + 1}", address.params.get("lever", "0,0,0"))
-        rng = np.random.default_rng(abs(int(address.number("seed", 0))))  # the same for all axes: there is one machine
-        scene = TrackerScene(self.world, replace(address, params={**address.params, "lever": lever}), rng)
+        scene = TrackerScene(self.world, replace(address, params={**address.params, "lever": lever}))
         return Beam(direction / np.linalg.norm(direction), scene, address.number("scale", 0.0))
 
     # ------------------------------------------------------------------ requests

@@ -63,11 +63,14 @@ class TrackerScene:
         with the thermal errors of the machine), ``repeatability`` (m, one sigma per direction, drawn at each commanded
         position), ``air_temperature`` (degC; default: the machine's surroundings), ``air_pressure`` (Pa),
         ``air_humidity`` (%).
-    rng : Generator
-        Random numbers for the repeatability.
+
+    Notes
+    -----
+    The error of repeatability is a function of the seed, the position and the instant of the arrival: it is the same
+    for all instruments of a machine, and in a test that is continued in another process.
     """
 
-    def __init__(self, world: VirtualWorld, address: Address, rng: np.random.Generator) -> None:
+    def __init__(self, world: VirtualWorld, address: Address) -> None:
         self.world = world
         self.station = np.array(numbers(address, "station", STATION))
         self.lever = np.array(numbers(address, "lever", "0,0,0"))
@@ -81,7 +84,7 @@ class TrackerScene:
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # from the tracker's frame to the machine's
         self._thermal = bool(address.number("thermal", 0))
         self._repeatability = address.number("repeatability", 0.0)
-        self._rng = rng
+        self._seed = abs(int(address.number("seed", 0)))
         self._arrival: tuple[Array, Array] | None = None
         self._last: tuple[Array, Array] | None = None
         self._air = tuple(
@@ -118,8 +121,10 @@ class TrackerScene:
         """Return the error of repeatability at the position at which the machine has arrived, m."""
         if self._repeatability == 0:
             return np.zeros(3)
-        if self._arrival is None or not np.array_equal(self._arrival[0], place):
-            self._arrival = (place.copy(), self._repeatability * self._rng.normal(size=3))
+        arrived = np.array([self.world.path.end, *place]) + 0.0  # no -0
+        if self._arrival is None or not np.array_equal(self._arrival[0], arrived):
+            rng = np.random.default_rng([self._seed, *map(int, arrived.view(np.uint64))])
+            self._arrival = (arrived, self._repeatability * rng.normal(size=3))
         return self._arrival[1]
 
     def seen(self, times: Array) -> Array:

@@ -149,11 +149,17 @@ class VirtualWorld(Motion):
     def _restart(self, time: float, position: ArrayLike) -> None:
         """Set the clock, with the axes at rest and nothing in progress."""
         self._set_clock(time)
-        self.motion, self.path, self.program, self._warm_up = None, Path.resting(position), "", None
+        self.motion, self.path, self.program, self._warm_up = None, Path.resting(position, time), "", None
         self.port_output, self._program_events = [], []
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state of the axes at rest, from which the times of later motions follow: see `restore`."""
+        """Return the state of the axes at rest, from which the times of later motions follow: see `restore`.
+
+        Both worlds count as having arrived at this instant.
+        """
+        with self._change:
+            if self.motion is None and self.time >= self.path.end:
+                self.path = Path.resting(self.position(), self.time)
         return {
             "time": self.time,
             "position": self.position(),

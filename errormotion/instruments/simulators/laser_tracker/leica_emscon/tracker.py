@@ -48,7 +48,7 @@ class Tracker:
         absolute: bool,
         obstructed: Callable[[int], bool],
     ) -> None:
-        self.scene = TrackerScene(world, address, rng)
+        self.scene = TrackerScene(world, address)
         self.absolute = absolute
         self.noise = address.number("noise", 0.5e-6)
         self.angle_noise = address.number("angle_noise", 3e-6)

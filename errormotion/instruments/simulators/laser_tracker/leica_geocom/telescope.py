@@ -77,7 +77,7 @@ class Telescope:
         rng: np.random.Generator,
         obstructed: Callable[[int], bool],
     ) -> None:
-        self.scene = TrackerScene(world, address, rng)
+        self.scene = TrackerScene(world, address)
         self.noise = address.number("noise", 0.3e-3)
         self.angle_noise = address.number("angle_noise", 2.4e-6)
         self.dead_path = address.number("dead_path", 0.0)
