@@ -51,6 +51,7 @@ CASES = (
     Case("multilateration", "", "displacement", 0.2e-6),
     Case("normal_vector", "", "touch", 0.25e-6),
     Case("r_test", "three spheres", "displacement", 0.2e-6, "", "angle"),
+    Case("crossbeam_scan", "scan", "height", 0.5e-6, "", "profile"),
     Case("circular_test", "", "length", 0.2e-6, "run", "sample"),
 )
 

@@ -354,13 +354,18 @@ def _noise(
             )
         return estimated
     if settings.noise == "auto" and np.isfinite(estimated):
-        limit = np.sqrt(stats.chi2.ppf(1 - FALSE_ALARM, 0.4 * degrees) / (0.4 * degrees))
+        least, limit = np.sqrt(stats.chi2.ppf([FALSE_ALARM, 1 - FALSE_ALARM], 0.4 * degrees) / (0.4 * degrees))
         if estimated > limit * stated:
             notes.append(
                 f"Readings scatter by {1e6 * estimated:.3g} um, more than the stated {1e6 * stated:.3g} um; the "
                 "larger value is used."
             )
             return estimated
+        if estimated < least * stated:
+            notes.append(
+                f"Readings scatter by {1e6 * estimated:.3g} um, less than the stated {1e6 * stated:.3g} um, which is "
+                "used. State the noise of this bar, or check the unit of both."
+            )
     return stated
 
 

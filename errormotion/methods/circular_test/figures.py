@@ -35,7 +35,7 @@ from errormotion.estimation.extremes import FLAT, POINTED, of_noisy_values
 from errormotion.estimation.fit import fit
 from errormotion.estimation.sources import errors_of
 from errormotion.methods.circular_test.circles import DRIFT, Circles, places_of, problem_of
-from errormotion.methods.circular_test.path import circle, middles
+from errormotion.methods.circular_test.path import TAU, circle, middles
 from errormotion.methods.circular_test.settings import Settings
 
 MEANINGS = {
@@ -54,8 +54,9 @@ DECAYS = (1 / 12, 1 / 6, 1 / 3, 2 / 3, 1.0, 2.0)
 """Decays of spikes relative to the setting."""
 READINGS_EACH = 3
 """Mean number of readings in a sector of the path of the figures."""
-WITHIN = 2
-"""Parts of such a sector at which the model is evaluated."""
+OF_DECAY, PARTS = 24, (1, 8)
+"""Parts of such a sector over which the model is averaged: in a decay of a spike, which loses 1 / 48 then; limits of
+their pairs."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,16 @@ def _of_sectors(circles: Circles, settings: Settings, places: int, decay: float,
     errors = errors_of(fit(problem), places_of(sectors), shared=DRIFT)
     sources = sorted(errors.sources, key=lambda source: source.group == DRIFT)
     found = circles.model(decay)[1]
-    within = circles.over_sectors(places * WITHIN, decay) @ found
-    shape = within - np.repeat(circles.over_sectors(places, decay) @ found, WITHIN, axis=1)
+    parts = 2 * int(np.clip(np.ceil(OF_DECAY / 2 * TAU / places / decay), *PARTS))
+    within = circles.over_sectors(places * parts, decay) @ found
+    shape = within - np.repeat(circles.over_sectors(places, decay) @ found, parts, axis=1)
     value, u = errors.value.reshape(2, -1), np.sqrt(errors.own).reshape(2, -1)
     shared = np.array([source.effect for source in sources]).reshape(-1, 2, places)
-    return of_path(value, np.where(np.isfinite(value), u, np.nan), shared, shape, [each.name for each in sources])
+    its = of_path(value, np.where(np.isfinite(value), u, np.nan), shared, shape, [each.name for each in sources])
+    # The mean over a part reduces a spike as well: by as much as parts of twice the width reduce it further
+    wide = np.repeat(shape.reshape(2, -1, 2).mean(axis=2), 2, axis=1)
+    lost, less = (evaluate(np.repeat(value, parts, axis=1) + each) for each in (shape, wide))
+    return replace(its, covariance=its.covariance + np.diag((lost - less) ** 2))
 
 
 def of_path(
