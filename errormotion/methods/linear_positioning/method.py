@@ -29,7 +29,7 @@ class LinearPositioning(ModelMethod):
         id="linear_positioning",
         summary="Positioning accuracy and repeatability of a linear axis after ISO 230-2; its straightness and angles",
         status="simulated_only",
-        version="4",
+        version="5",
         cannot_see=(
             "freedoms that were not measured",
             "errors between the targets that vary over less than the interval of the targets",

@@ -194,8 +194,8 @@ class Settings(PluginSettings):
     # Evaluation
     scatter: Literal["auto", "pooled", "target"] = Field(
         default="auto",
-        description="variance of the readings: one for all targets (pooled), each target its own (target), or pooled "
-        "unless the variances differ significantly (auto)",
+        description="variance of the readings of each approach: one for all targets (pooled), each target its own "
+        "(target), or pooled unless the variances differ significantly (auto)",
     )
     trials: int = Field(
         default=2000, ge=200, le=100_000, description="simulated repetitions for bias and uncertainty of the figures"

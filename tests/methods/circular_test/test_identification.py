@@ -292,7 +292,7 @@ def test_figures_of_spikes_that_few_readings_see_are_not_too_small():
         raw, truth = CircularTest().simulate(SMALL, seed)
         found = CircularTest().identify(raw, SMALL)
         z.append((found["figures"] - truth["figures"]).values / np.sqrt(np.diagonal(found["figure_covariance"].values)))
-    # the mean of 12 has a standard deviation of 0.3; a spike that is averaged over half a degree made G smaller by 1.4 u
+    # the mean of 12 has a standard deviation of 0.3; an averaged spike made G smaller by 1.4 u
     assert np.abs(np.mean(z, axis=0)[:4]).max() < 0.9
 
 

@@ -120,9 +120,11 @@ def _trials(
     n = np.isfinite(x).sum(axis=1)
     measured = n.any(axis=1)
     both = bool(measured.all())
-    own = draw_variances(
-        spread.own, spread.own_freedom, trials, generator, common=spread.pooled
-    )  # (trial, approach, target)
+    own = np.full((trials, 2, m), np.nan)
+    for approach in np.flatnonzero(measured):
+        own[:, approach] = draw_variances(
+            spread.own[approach], spread.own_freedom, trials, generator, common=spread.pooled
+        )
     common, opposite = (
         draw_components(spread.run[two], spread.noise[two], spread.freedom[two], trials, generator)  # (trial, 2)
         for two in (slice(2), slice(2, 4))

@@ -7,8 +7,8 @@ Model of a reading of approach a, run j, target i, with the position scaled to z
 ``o`` and ``q`` are an offset and a slope that both approaches of a run share (drift of the machine, expansion of its
 scale); ``p`` and ``w`` have the sign of the approach. All are independent from run to run: random effects, whose
 variances are estimated by restricted likelihood (`errormotion.estimation.components`). That of e is the scatter about
-lines through each run and approach, whatever these are. If no reading is missing, and no variance is 0, these are the
-estimates of an analysis of variance.
+lines through each run and approach, whatever these are; each approach has its own. If no reading is missing, and no
+variance is 0, these are the estimates of an analysis of variance.
 
 An estimated variance has the Student factor of `errormotion.estimation.variance.expansion`, with which an interval of
 k = 2 contains the truth in 95 % of all cases or more, whatever the degrees of freedom. It belongs to the variance of a
@@ -42,6 +42,8 @@ EFFECTS = ("offset", "slope", "opposite offset", "opposite slope")
 """Random effects of a run."""
 MIN_RUNS = 4
 """For an estimate of the drift: with fewer runs, its Student factor would exceed 2."""
+MIN_APPROACH = 10.0
+"""Degrees of freedom of each approach from which it has its own variance."""
 MIN_FREEDOM = 3
 """Smallest number of degrees of freedom for the scatter of all readings."""
 SIGNIFICANT = 1e-3
@@ -82,7 +84,7 @@ class Scatter:
     freedom : ndarray, (4,)
         Degrees of freedom of ``run + noise``; 0 where it is stated.
     pooled : bool
-        Whether all targets have one variance.
+        Whether all targets have one variance, of each approach.
     unequal : bool
         Whether the variances of the targets differ significantly, with too few runs for one of each: it is then at
         least the common one.
@@ -271,15 +273,21 @@ def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, f
     known = np.isfinite(residual)
     square = np.where(known, np.square(residual), 0.0).reshape(shape).sum(axis=1)
     redundancy = np.where(known, left, 0.0).reshape(shape).sum(axis=1)
-    if kind == "pooled" or (kind == "auto" and not _differ(square, redundancy)):
-        return np.full(square.shape, pooled), freedom, True, False
-    each = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), pooled)
+    # Readings of one approach may scatter more than those of the other, by friction or a spring: each has its own
+    common, of_approach = np.full(square.shape, pooled), redundancy.sum(axis=1)
+    if of_approach.min() >= MIN_APPROACH and square.any():
+        ratio = square.sum(axis=1) / of_approach / (square.sum() / of_approach.sum())
+        common *= np.maximum(ratio, SMALLEST)[:, None]
+        freedom *= float(of_approach.min() / of_approach.sum())
+    if kind == "pooled" or (kind == "auto" and not _differ(square / common, redundancy)):
+        return common, freedom, True, False
+    each = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), common)
     each = np.maximum(each, SMALLEST * pooled)
     of_each = float(np.median(redundancy[redundancy > 0.5]))
     if of_each > 2:
         return each, of_each, False, False
     if kind == "auto":
-        return np.maximum(each, pooled), freedom, False, True
+        return np.maximum(each, common), freedom, False, True
     least = int(np.ceil(2.0 * shape[1] / of_each)) + 1
     raise MethodError(
         f"Variances by target: expected {least} runs or more at these targets; found {shape[1]}. Use scatter 'pooled'.",
