@@ -63,10 +63,6 @@ class Network:
         """Pass frames with an identifier to ``receive(data)``, in the listening thread."""
         self._receivers[identifier] = receive
 
-    def unsubscribe(self, identifier: int) -> None:
-        """Ignore frames with an identifier from now on."""
-        self._receivers.pop(identifier, None)
-
     def send(self, identifier: int, data: bytes, reset: Reset | None = None) -> None:
         """Send a frame.
 

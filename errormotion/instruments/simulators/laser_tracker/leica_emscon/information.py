@@ -11,7 +11,6 @@ from errormotion.instruments.simulators.laser_tracker.leica_emscon.status import
 
 SERIAL = 390_000
 MIN_DISTANCE = 0.5  # m
-SECOND_NAME = "Simulated"
 REFLECTORS = (("RRR 1.5in", 5, 19.05e-3), ("RRR 0.5in", 6, 6.35e-3), ("Cat's eye", 2, 0.0))
 """Name, target type and surface offset (m); their numbers count from 1."""
 
