@@ -19,6 +19,8 @@ from errormotion.testing.results import covariance, influence, names, raw_data, 
 
 TRIALS = 40
 """Trials of each source; with five freedoms, a standard uncertainty that is 1.25 times too large is detected."""
+SMALL = 1e-3
+"""Fraction of a standard uncertainty below which draws and influence need not agree, as effects of second order."""
 
 
 def why_no_redrawing(subject: MethodSubject) -> str:
@@ -58,7 +60,17 @@ def sources_as_stated(subject: MethodSubject) -> str:
             if not (np.nan_to_num(np.diagonal(stated[place])) > 0).any():
                 continue
             off = found[:, place] - values(errors)[place]
-            off[:, ~(np.nan_to_num(np.diagonal(stated[place])) > 0)] = np.nan
+            u, total = (np.sqrt(np.nan_to_num(np.diagonal(C[place]))) for C in (stated, covariance(errors)))
+            moving = u > SMALL * total
+            for name, its, most in zip(
+                names(errors), off.T, np.where(moving, np.inf, SMALL * (u + total)), strict=True
+            ):
+                size = float(np.sqrt(np.mean(np.square(its))))
+                require(
+                    not size > 2 * most,
+                    f"{what}, point {place}: the draws move {name} by {size:.2g}, more than its influence states",
+                )
+            off[:, ~moving] = np.nan
             repeated = np.repeat(stated[place][None], TRIALS, axis=0)
             verdict = require_honest(off, repeated, names(errors), f"{what}, point {place}", share=len(places))
             verdicts.append(verdict)
