@@ -5,8 +5,8 @@ import pytest
 
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
-from errormotion.methods.crossbeam_scan.identification.registration import prepare
-from errormotion.methods.crossbeam_scan.identification.registrations import register_all
+from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
+from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, _of_strains, register_all
 from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin.sensors.profiler import Profiler
 
@@ -25,3 +25,30 @@ def test_points_too_far_apart_for_the_relief_are_reported(gantry, pitch, notes):
     found = register_all(Scans(raw), [0], 0.5e-6, Settings())
     assert len(found.notes) == notes
     assert all("Reduce the pitch of points and lines" in note for note in found.notes)
+
+
+def test_error_of_a_registration_by_strains_that_it_does_not_estimate():
+    """Pictures that a warm profiler, or a warm artefact, has of one surface are registered as rigid ones."""
+    x, y = 25e-6 * (np.arange(480) - 200), 70e-6 * (np.arange(240) - 100)
+    X, Y = np.meshgrid(x, y)
+
+    def surface(x, y):
+        return 1e-3 * np.sin(600 * x + 100 * y) + 1e-3 * np.cos(500 * y - 80 * x) + 3e-3
+
+    cold, e = prepare(surface(X, Y), x, y), 100e-6
+    # A strain enlarges the warm picture to that of the cold scan.
+    pictures = {
+        "scale_x": surface((1 + e) * X, Y),
+        "scale_z": surface(X, Y) / (1 + e),
+        "expansion": surface((1 + e) * X, (1 + e) * Y) / (1 + e),
+    }
+    for k, name in enumerate(STRAINS):
+        warm = prepare(pictures[name], x, y)
+        found = register(cold, warm, point=np.zeros(3), line_effects=False)
+        effect = _of_strains(cold, warm, found)[:, k]
+        tight = register(cold, warm, point=np.zeros(3), line_effects=False, extra={name: 1e-9})
+        as_estimated = -tight.joint_covariance[:6, 6] / 1e-18
+        for part in (slice(0, 3), slice(3, 6)):
+            expected = e * effect[part]
+            assert found.twist[part] == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
+            assert as_estimated[part] == pytest.approx(effect[part], abs=0.02 * np.abs(effect[part]).max())

@@ -6,7 +6,8 @@ import pytest
 from errormotion.datasets import validate
 from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
-from errormotion.methods.crossbeam_scan import simulation
+from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
+from errormotion.methods.crossbeam_scan.settings import Settings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
@@ -112,3 +113,39 @@ def test_invalid_arguments_are_refused(gantry):
         simulation.raw_scans(gantry, [0], [0.0], seed=1, motion="stiff")
     with pytest.raises(BenchError, match="two lines"):
         simulation.raw_scans(gantry, [0], [0.0], seed=1, profiles=1)
+
+
+class _Ones:
+    """Draws of one standard uncertainty."""
+
+    def normal(self, size=None):
+        return np.ones(() if size is None else size)
+
+
+@pytest.mark.parametrize(
+    ("strain", "group", "sign"),
+    [
+        ("scale", "scale of the profiler", -1),
+        ("expansion", "expansion of the artefacts", -1),
+        ("mount_expansion", "expansion of the mount", 1),
+    ],
+)
+def test_strained_scans_have_the_effect_that_the_result_states(strain, group, sign):
+    """A strain is the one that takes the warm picture to the cold one: of a larger picture it is negative."""
+    machine = VirtualMachine("gantry", seed=3)
+    profiler = Profiler(800, 25e-6, disturbances=Disturbances(noise=10e-9, jitter_y=0, jitter_z=0, speckle=0))
+    raw = simulation.raw_scans(machine, [0, 7200], [0.1], seed=1, profiles=400, profiler=profiler, motion="rigid")
+    nothing = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansion_uncertainty": 0.0}
+    options = {"strain": "rigid", "artefact_height": 0.1}
+    name = f"{strain}_uncertainty"
+    strained = simulation.strained(raw, Settings(**options, **nothing | {name: 100e-6}), _Ones())
+    # so small an uncertainty that the registration takes the strain as 0
+    before, after = (
+        CrossbeamScan().identify(each, Settings(**options, **nothing | {name: 1e-9})) for each in (raw, strained)
+    )
+    F = before["influence"].transpose("source", "time", "position", "dof").values[:, 1, 0]
+    change = (after.em.twist().values - before.em.twist().values)[1, 0]
+    stated = -sign * 100e-6 / 1e-9 * F[before["source_group"].values == group].sum(axis=0)
+    for part in (slice(0, 3), slice(3, 6)):
+        assert change[part] == pytest.approx(stated[part], abs=0.03 * np.abs(stated[part]).max() + 1e-8)
+    assert np.abs(stated[:3]).max() > 5e-6
