@@ -20,8 +20,9 @@ from errormotion.datasets import provenance
 from errormotion.estimation.checks.correlated import coloured
 from errormotion.estimation.derivatives import along, column
 from errormotion.estimation.problem import Problem
+from errormotion.estimation.sources import errors_of
 from errormotion.kinematics.iso import DOF
-from errormotion.measurement.identification import Solved, dataset, solve, values_of
+from errormotion.measurement.identification import Solved, dataset, related, solve, values_of
 from errormotion.measurement.observed import Model, Observed, as_expected
 from errormotion.plugins import MethodInfo, Redraw, Redrawing, replaced
 
@@ -87,6 +88,10 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     true = moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)
     measured = _recorded(observed, raw, y, generator)
+    # Errors may depend on the constants themselves, such as a lever.
+    linear = replace(exact.fit.linear, problem=replace(true, noise=exact.fit.problem.noise))
+    drawn_errors = errors_of(replace(exact.fit, linear=linear), observed.places, shared=observed.shared)
+    exact = replace(exact, relative=related(observed, drawn_errors))
     truth = dataset(model, exact, raw, info, provenance.make(settings, None, None, steps=["simulation"], seed=seed))
     zero = truth.copy()
     for key in ("covariance", "influence", "deviation_variance", "deviation_influence"):

@@ -208,6 +208,24 @@ def test_simulated_data_are_covered() -> None:
     assert abs(inside / seeds - 0.95) < 3.3 * np.sqrt(0.95 * 0.05 / seeds)
 
 
+def test_truth_of_simulated_data_contains_constants_on_which_the_errors_depend() -> None:
+    """The gain is a factor of the errors only, not of the readings."""
+
+    class OfErrors(Drift):
+        def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+            observed = super().observe(raw, settings)
+            problem = replace(observed.problem, equation=lambda y, x, c: y - x.drift[:, 0])
+            return replace(observed, problem=problem, places=Places(lambda x, c: x.drift * c.gain, settings.times))
+
+    method, ratios, settings = OfErrors(), [], DriftSettings(noise=0.05e-6)
+    for seed in range(60):
+        raw, truth = method.simulate(settings, seed)
+        off = (method.identify(raw, settings)["EZ"] - truth["EZ"]).values[-1]
+        ratios.append(off / (settings.gain * 20e-6 * (1 - np.exp(-420 / 900))))
+    # 60 draws: 1 +- 0.09; the noise of two times of five repeats adds 2 %
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.02, abs=0.35)
+
+
 def test_a_method_without_instruments_refuses_to_measure() -> None:
     with raises("method.imported_only"):
         METHOD.acquire(None, SETTINGS, inputs={})  # type: ignore[arg-type]
