@@ -129,7 +129,7 @@ class CrossbeamScan(ModelMethod):
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> list[Step]:
         """Return every step of the machine, for the check of its limits and for a dry run."""
-        from errormotion.methods.crossbeam_scan.acquisition.motions import steps
+        from errormotion.methods.crossbeam_scan.acquisition.schedule import steps
 
         return steps(settings)
 

@@ -19,7 +19,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint, from_maps, pose_twists
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
-from errormotion.methods.crossbeam_scan.identification.registration.extra import BASES
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import BASES
 from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, estimated
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import PoseSettings

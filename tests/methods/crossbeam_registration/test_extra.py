@@ -6,7 +6,7 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
-from errormotion.methods.crossbeam_scan.identification.registration.extra import BASES
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import BASES
 
 TWIST = np.array([23e-6, -41e-6, 17e-6, 30e-6, -55e-6, 80e-6])
 CENTRE = np.array([0.2e-3, -0.3e-3, 0.5e-3])

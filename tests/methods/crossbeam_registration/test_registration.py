@@ -14,7 +14,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.identification.registration import kernels, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import lag_sums
-from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
 registering = import_module("errormotion.methods.crossbeam_scan.identification.registration.register")

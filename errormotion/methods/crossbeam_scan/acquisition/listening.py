@@ -12,7 +12,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.errors import InstrumentError, InstrumentTimeoutError
-from errormotion.methods.crossbeam_scan.encoder import unwrapped
+from errormotion.methods.crossbeam_scan.identification.cutting import unwrapped
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

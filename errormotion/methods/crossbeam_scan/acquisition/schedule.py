@@ -24,6 +24,16 @@ from errormotion.methods.crossbeam_scan.acquisition.programs import (
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.settings import Settings
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from errormotion.methods.crossbeam_scan.acquisition.programs import Dwell
+from errormotion.plugins import Step
+
+if TYPE_CHECKING:
+    from errormotion.methods.crossbeam_scan.settings import Settings
+
 
 PROGRAM_INTERVAL = 5.0
 """Time between two programs, in which the control starts the next one, s."""
@@ -148,3 +158,31 @@ def program_texts(settings: Settings) -> dict[str, str]:
     if settings.procedure == "profiler_pose":
         return texts([pocket_pass(settings, k) for k in range(1, len(settings.pocket_lifts) + 1)], settings)
     return texts(list(schedule(settings).programs.values()), settings)
+
+
+def steps(settings: Settings) -> list[Step]:
+    """Return every step of the axis Y, and of Z where the settings state it, in the order of the programs.
+
+    Raises
+    ------
+    MethodError
+        As for `schedule`.
+    """
+    if settings.procedure == "profiler_pose":
+        programs = [pocket_pass(settings, k) for k in range(1, len(settings.pocket_lifts) + 1)]
+    else:
+        plan = schedule(settings)
+        programs = [plan.programs[item.program] for item in plan.items]
+    return list(_steps(programs))
+
+
+def _steps(programs: list[Program]) -> Iterator[Step]:
+    position = dict.fromkeys("XYZ", math.nan)
+    for program in programs:
+        for step in program.steps:
+            if isinstance(step, Dwell):
+                yield Step("rest", None, math.nan, step.seconds)
+                continue
+            distance = abs(step.position - position[step.axis])
+            position[step.axis] = step.position
+            yield Step("move", (position["X"], position["Y"], position["Z"]), step.feed, distance / step.feed)

@@ -16,11 +16,20 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.crossbeam_scan.encoder import OVERFLOW, unwrapped
+
+OVERFLOW = 2.0**32
+"""Counts after which an encoder starts again from zero."""
+
+
+def unwrapped(counts: ArrayLike, middle: float) -> Array:
+    """Return encoder counts corrected by whole overflows to be nearest to the count in the middle of the axis."""
+    counts = np.asarray(counts, dtype=float)
+    return np.asarray(counts - OVERFLOW * np.rint((counts - middle) / OVERFLOW))
+
 
 Scan = tuple[NDArray[np.float32], Array, Array, float]
 

@@ -20,7 +20,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.cutting import Scan
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
-from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Extra
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
 if TYPE_CHECKING:

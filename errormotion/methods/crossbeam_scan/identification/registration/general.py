@@ -31,7 +31,7 @@ from errormotion.kinematics.twists import cross_matrix
 from errormotion.methods.crossbeam_scan.identification.registration import clouds
 from errormotion.methods.crossbeam_scan.identification.registration.clouds import Normals
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import freedoms, refuse, scales
-from errormotion.methods.crossbeam_scan.identification.registration.result import Registration
+from errormotion.methods.crossbeam_scan.identification.registration.register import Registration
 from errormotion.methods.crossbeam_scan.identification.registration.solver import inverse
 
 NOISY = 10.0

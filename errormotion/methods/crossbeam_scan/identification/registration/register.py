@@ -1,4 +1,4 @@
-"""The registration of two block maps, and the choice of its backend."""
+"""The registration of two block maps: its result, where it starts, and the choice of its backend."""
 
 from __future__ import annotations
 
@@ -8,16 +8,22 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
 
 from errormotion.arrays import Array
 from errormotion.datasets import DOF
 from errormotion.errors import MethodError
 from errormotion.estimation.robust import scale_about_zero
+from errormotion.kinematics import poses
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import THIN, BlockMap
-from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
-from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Freedoms, freedoms, refuse, scales
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import (
+    Extra,
+    Freedoms,
+    freedoms,
+    refuse,
+    scales,
+)
 from errormotion.methods.crossbeam_scan.identification.registration.kernels.planes import ROWS
-from errormotion.methods.crossbeam_scan.identification.registration.result import Registration
 from errormotion.methods.crossbeam_scan.identification.registration.solver import (
     Noise,
     Problem,
@@ -28,7 +34,95 @@ from errormotion.methods.crossbeam_scan.identification.registration.solver impor
     normal_equations,
     solve,
 )
-from errormotion.methods.crossbeam_scan.identification.registration.start import Start, descend, search
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Pose of the warm scan's frame in the cold scan's frame, with its covariance.
+
+    Attributes
+    ----------
+    backend : str
+        The backend that was used.
+    pose : RigidTransform
+        M: takes a point from the warm frame to the cold one. Extra parameters come after it and leave ``point``
+        where it is: p of the warm frame is at ``point`` + (1 + sum e G) (M p - ``point``) of the cold one.
+    point : ndarray (3,)
+        Functional point of twist and covariance, in profiler coordinates, m.
+    covariance : ndarray (6, 6)
+        Of the twist at ``point``, m^2, m rad, rad^2; NaN for freedoms that the artefact does not determine, and all
+        NaN where a backend gives none.
+    residual : ndarray (block row, block column)
+        Distance of the warm blocks from the cold surface along z, m; NaN where there is none. Empty for clouds.
+    x, y : ndarray
+        Centres of the blocks in the warm frame, m.
+    rms : float
+        Root mean square of the residuals of the backend, m. It gives no information about the accuracy of the pose.
+    points : int
+        Points used of the warm scan.
+    noise : tuple of float
+        Standard deviation of a point about the surface, cold and warm, m.
+    line_jitter : tuple of float
+        Standard deviation, both scans together, of a profile's shift along z and along y, m; 0 where none shows.
+    condition : float
+        Of the information, rotations scaled by the artefact's radius.
+    loose : tuple of str
+        Freedoms that the artefact does not determine.
+    iterations : int
+        Steps taken.
+    extra_names : tuple of str
+        Further parameters that were estimated.
+    extra : ndarray (k,)
+        Their values: each displaces a point P of the cold frame by its matrix times (P - ``point``).
+    joint_covariance : ndarray (6 + k, 6 + k)
+        Of the twist at ``point`` and the further parameters; ``covariance`` is its first block.
+    cold_share : float
+        Share of the covariance that comes from the noise of the cold scan, which all warm scans registered onto it have
+        in common.
+    """
+
+    backend: str
+    pose: RigidTransform
+    point: Array
+    covariance: Array
+    residual: Array
+    x: Array
+    y: Array
+    rms: float
+    points: int
+    noise: tuple[float, float]
+    line_jitter: tuple[float, float]
+    condition: float
+    loose: tuple[str, ...]
+    iterations: int
+    extra_names: tuple[str, ...]
+    extra: Array
+    joint_covariance: Array
+    cold_share: float
+    variance_factor: float = 1.0
+
+    @property
+    def twist(self) -> Array:
+        """How the profiler moved: (EX, EY, EZ, EA, EB, EC) at ``point``, m and rad."""
+        return poses.displacement(self.pose, self.point)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard uncertainties of the twist, (6,), m and rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def at(self, point: Array) -> tuple[Array, Array]:
+        """Return twist (6,) and covariance (6, 6) at another point (3,) of the profiler's frame, m."""
+        twist, _, covariance = self.joint_at(point)
+        return twist, covariance[:6, :6]
+
+    def joint_at(self, point: Array) -> tuple[Array, Array, Array]:
+        """Return twist (6,), extra parameters (k,) and their covariance (6 + k, 6 + k) about another point (3,), m."""
+        terms = Extra.of(dict.fromkeys(self.extra_names, np.inf))
+        shift = np.asarray(point, dtype=float) - self.point
+        pose = terms.pose_about(self.pose, self.extra, shift)
+        return poses.displacement(pose, point), self.extra, terms.moved(self.joint_covariance, shift)
+
 
 Backend = Literal["height_map", "open3d_plane", "paper"]
 
@@ -47,6 +141,14 @@ NEAR = 0.01
 STRAIGHT = 400.0
 """Steps up to this squared length, in standard deviations, are linear: an error of 0.01 remains."""
 _STEPS = 20
+SHIFTS = np.linspace(-2e-3, 2e-3, 5)
+SETTLED = 1e-7
+"""Steps that move the surface by less than this, m, end the descent: the next would be a thousandth of it."""
+YAWS = np.linspace(-0.05, 0.05, 5)
+_WHITE = Noise()
+_LEVEL = [2, 3, 4]
+_KEPT = 6
+_DESCENT = 25
 
 
 def register(
@@ -273,3 +375,60 @@ def _unknown(covariance: Array, free: Freedoms) -> Array:
     share = np.sum(free.motions**2, axis=1)
     undetermined_here = (share > 0.01) | np.array([name in free.loose for name in DOF])
     return np.where(undetermined_here[:, None] | undetermined_here[None, :], np.nan, covariance)
+
+
+# where Gauss-Newton starts: at rest where that fits, else at the best of a coarse grid of shifts and yaws
+
+
+@dataclass(frozen=True)
+class Start:
+    """A state, the robust scale of the residuals there (m), and the steps it took."""
+
+    state: State
+    scale: float
+    steps: int
+    overlap: float = 0.0
+    """Share of the known warm blocks that have cold surface beneath them."""
+
+
+def descend(problem: Problem, state: State, motions: Array, radius: float, steps: int = _DESCENT) -> Start:
+    """Take Gauss-Newton steps with the blocks that fit until they no longer move the surface by the noise."""
+    gate, done, known = np.inf, 0, np.count_nonzero(np.isfinite(problem.stack[3]))
+    for done in range(1, steps + 1):
+        sums = problem.evaluate(state, gate)
+        if 4 * sums.used < known:
+            if gate < np.inf:
+                gate = np.inf
+                continue
+            return Start(state, np.inf, done)
+        step = solve(*normal_equations(sums, _WHITE), motions, radius)
+        size = float(np.max(np.abs(step * [1, 1, 1, radius, radius, radius])))
+        # A step beyond the surface's features leads nowhere.
+        state = problem.stepped(state, step * min(1.0, 2e-3 / max(size, 1e-12)))
+        gate = max(6 * sums.scale(), 1e-9)
+        if size < SETTLED:
+            break
+    sums = problem.evaluate(state)
+    return Start(state, sums.scale(), done, np.count_nonzero(np.isfinite(sums.residual)) / known)
+
+
+def search(problem: Problem, motions: Array, radius: float) -> Start:
+    """Return the best descent from a grid of shifts and yaws about the centre."""
+    tried = []
+    for x in SHIFTS:
+        for y in SHIFTS:
+            for yaw in YAWS:
+                state = problem.stepped(problem.rest, np.array([x, y, 0.0, 0.0, 0.0, yaw]))
+                for _ in range(2):
+                    sums = problem.evaluate(state)
+                    if sums.used < 16:
+                        break
+                    H, h = normal_equations(sums, _WHITE)
+                    level = np.zeros(6)
+                    level[_LEVEL] = -np.linalg.solve(H[np.ix_(_LEVEL, _LEVEL)], h[_LEVEL])
+                    state = problem.stepped(state, level)
+                else:
+                    tried.append(Start(state, problem.evaluate(state).scale(), 3))
+    tried.sort(key=lambda start: start.scale)
+    ends = [descend(problem, start.state, motions, radius) for start in tried[:_KEPT]]
+    return min(ends, key=lambda start: start.scale, default=Start(problem.rest, np.inf, 0))

@@ -28,8 +28,7 @@ from errormotion.arrays import Array
 from errormotion.estimation.robust import NORMAL_MAD
 from errormotion.methods.crossbeam_scan.identification.registration.blocks import BlockMap, some_of, upper_median
 from errormotion.methods.crossbeam_scan.identification.registration.comparison import compare, lag_sums
-from errormotion.methods.crossbeam_scan.identification.registration.extra import Extra
-from errormotion.methods.crossbeam_scan.identification.registration.freedoms import scales
+from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Extra, scales
 
 NONE = Extra.of(None)
 LINE = [2, 1]
