@@ -89,7 +89,7 @@ def test_plan_agrees_with_the_stated_uncertainty_of_the_identification(machine, 
 
 
 def test_a_plan_of_scans_is_a_valid_dataset_of_zeros():
-    ds = plan(positions=PLACES, warm_up=WARM_UP)
+    ds = plan(positions=PLACES, warm_up=WARM_UP, profiler_pose={"dz": -0.174})
     datasets.validate(ds)
     assert ds["time"].values.tolist() == [0, *WARM_UP]
     assert ds["y"].values.tolist() == list(PLACES)

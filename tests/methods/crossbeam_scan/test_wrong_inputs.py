@@ -73,6 +73,9 @@ def assert_lost_alone(found, errors, reason, cycles=(CYCLE,), artefact=ARTEFACT)
     np.testing.assert_array_equal(found["reason"].values != "", lost)
     for text in found["reason"].values[lost]:
         assert reason in text
+    names = found["source"].values.tolist()  # without those that had an effect on the lost scan alone
+    errors = errors.sel(source=errors["source"].isin(names)) if "source" in errors.indexes else errors.isel(
+        source=np.flatnonzero(np.isin(errors["source"].values, names)))  # fmt: skip
     for name in (*found.em.iso_names(), "covariance", "influence", "registration_u", "strain"):
         there, clean = (np.moveaxis(one[name].transpose("time", "position", ...).values, (0, 1), (0, 1))
                         for one in (found, errors))  # fmt: skip

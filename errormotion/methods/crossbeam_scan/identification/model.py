@@ -147,7 +147,8 @@ class Campaign:
         n = cycles * artefacts
         at, known = np.arange(n), self.known.ravel()
         rows = at if self.guide is None else at[:, None] // artefacts * artefacts + np.arange(artefacts)
-        C = np.where(known[:, None, None], self.found.covariance.reshape(n, 9, 9)[:, :6, :6], np.eye(6))
+        C = self.found.covariance.reshape(n, 9, 9)[:, :6, :6].copy()
+        C[~known] = C[np.argmax(known)] if known.any() else np.eye(6)  # has no effect
         share = np.where(known, self.found.cold_share.ravel(), 0.0)
         readings = np.where(known[:, None], self.found.twist.reshape(n, 9)[:, :6], np.nan)
         root = _root(C)

@@ -24,7 +24,7 @@ from errormotion.methods.crossbeam_scan.identification.artefacts import MOVED, A
 from errormotion.methods.crossbeam_scan.identification.chain import Rig
 from errormotion.methods.crossbeam_scan.identification.curves import curves
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
-from errormotion.methods.crossbeam_scan.identification.model import Campaign
+from errormotion.methods.crossbeam_scan.identification.model import COLD, Campaign
 from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, Maps, Registrations, register_all
 from errormotion.methods.crossbeam_scan.settings import HEIGHT, STRAIN
 
@@ -211,11 +211,10 @@ def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
         reference="cold scans of the artefacts, before the warm-up",
         attributes={
             "start": warm_up_start(raw, found.time, cold),
-            "reference_sources": campaign.cold_names,
             "reference_interval": (0.0, 0.0),
         },
         attrs={"registration": settings.registration, "strain": settings.strain, **for_frame},
-        finish=_finished if measured else None,
+        finish=lambda solved: _finished(solved, measured),
         record=None if measured else campaign.recorded,
         notes=[*_notes(reason, positions, campaign.rig), *_strain_notes(settings), *check.notes, *corrected],
         doubts=[*check.doubts, *found.notes],
@@ -223,9 +222,15 @@ def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
     return observed, Evaluated(every, campaign, rows, cold, time, check, reason)
 
 
-def _finished(solved: Solved) -> Solved:
-    """Return a solution without the note that its noise is unchecked: registrations find it in their residuals."""
-    if solved.scatter.verdict is Verdict.MORE:
+def _finished(solved: Solved, measured: bool) -> Solved:
+    """Return a solution that names the sources of its reference state: cold scans, of those that have an effect.
+
+    Registrations find their noise in their residuals: where they are ``measured``, it is not noted as unchecked.
+    """
+    names = [source.name for source in solved.relative.errors.sources if source.group == COLD]
+    attributes = {**solved.observed.attributes, "reference_sources": names}
+    solved = replace(solved, observed=replace(solved.observed, attributes=attributes))
+    if solved.scatter.verdict is Verdict.MORE or not measured:
         return solved
     return replace(solved, scatter=replace(solved.scatter, note=""))
 
