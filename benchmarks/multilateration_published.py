@@ -154,9 +154,8 @@ def relative_bound(target: Array, station: Array, *, noise: float, first: int = 
     sd[:, first] *= 1e-3
     changes = np.zeros((len(station), *sd.shape))
     changes[np.arange(len(station)), np.arange(len(station)), first] = noise
-    sources = Sources(scales=[Shared(f"station {j + 1}", "first target", each) for j, each in enumerate(changes)])
-    stated = bound(target, station, noise=sd, sources=sources)
-    return stated.solved.relative.errors.covariance, stated
+    sources = Sources(scales=[Shared(f"station {j + 1}", each) for j, each in enumerate(changes)])
+    return bound(target, station, noise=sd, sources=sources).covariance, bound(target, station, noise=sd)
 
 
 def jacobian(target: Array, stations: Stations, known: NDArray[np.bool_]) -> sp.csr_array:

@@ -1,13 +1,13 @@
 """Multilateration: volumetric errors from displacements of a reflector, measured from four or more stations.
 
-``method`` is the plugin. ``acquisition`` measures, ``identification`` determines errors from raw data, ``planning``
-predicts the uncertainty of a layout, ``report`` and ``figures`` present a result, ``simulation`` makes raw data with
-known errors.
+``method`` is the plugin. ``model`` states the equation, its unknowns and its sources, from which identification, plan,
+random draws and simulated data follow (`errormotion.measurement`). ``result`` reads raw data into the model and adds
+what follows from its solution, with ``start`` (approximate stations), ``determinacy`` (undetermined freedoms),
+``scale`` (air, expansion), ``drift``, ``repeatability`` and ``axes``. ``acquisition`` measures, ``planning`` searches the
+best layout, ``report`` and ``figures`` present a result, ``networks`` solves arrays without raw data.
 
-``network`` solves for targets and stations: ``model`` (the equation and its sources, for `errormotion.estimation`),
-``start`` (approximate stations), ``solver`` (fit, datum, outliers), ``network`` (result and covariances), and
-``diagnosis`` (outliers, undetermined freedoms). Source: Takeuchi et al., estimation of three-dimensional volumetric
-errors of numerically controlled machine tools by a laser tracker.
+Source: Takeuchi et al., estimation of three-dimensional volumetric errors of numerically controlled machine tools by a
+laser tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration
