@@ -81,14 +81,15 @@ def chunks(raw: xr.Dataset) -> Iterator[Chunk]:
     MethodError
         The record has no time.
     """
-    reading = raw["displacement"].transpose("sensor", "time")
+    reading = raw["displacement"]
     step = max(1, _CHUNK_BYTES // (reading.sizes["sensor"] * 8))
     stored = reading.encoding.get("preferred_chunks", {}).get("time", 1)
     if stored > 1:
         step = max(1, step // stored) * stored
     for first in range(0, reading.sizes["time"], step):
         part = slice(first, first + step)
-        values = np.asfortranarray(reading[:, part].values, dtype=np.float64)  # sample by sample
+        read = reading.isel(time=part).load()  # before it is turned: a lazy array that is turned is read value by value
+        values = np.asfortranarray(read.transpose("sensor", "time").values, dtype=np.float64)  # sample by sample
         encoder = np.asarray(raw["angle"][part].values, float) if "angle" in raw else np.zeros(0)
         yield Chunk(_times(raw, first, values.shape[1]), values, encoder)
 
