@@ -39,7 +39,7 @@ def test_sdo_replies_of_documents(vector: Vector) -> None:
     if "abort" in vector.expected:
         with pytest.raises(SdoRefusal, match=vector.expected["meaning"]) as refusal:
             upload_reply(vector.data, *at)
-        assert refusal.value.code == vector.expected["abort"]
+        assert refusal.value.number == vector.expected["abort"]
     else:
         expected = vector.expected.get("size", bytes.fromhex(vector.expected.get("data", "")))
         assert upload_reply(vector.data, *at) == expected

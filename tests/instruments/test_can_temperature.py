@@ -175,7 +175,7 @@ def test_a_refused_value_is_an_error_with_its_abort_code() -> None:
         entries[0x6130, 2] = (F32, SdoAbortedError(0x08000000))
         with pytest.raises(SdoRefusal, match="0x6130:2 is refused: Code 0x08000000, General error") as refusal:
             thermometer.read()
-        assert refusal.value.code == 0x08000000
+        assert refusal.value.number == 0x08000000
 
 
 def test_a_node_of_another_profile_is_refused() -> None:

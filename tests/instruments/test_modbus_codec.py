@@ -76,7 +76,7 @@ def test_invalid_data_are_a_protocol_error(framing: str, rubbish: bytes) -> None
 def test_an_exception_reply_is_a_refusal_with_a_text(framing: str, frame: bytes) -> None:
     with pytest.raises(ModbusRefusal, match=r"exception 2 \(illegal data address\)") as refusal:
         decode_answer(framing, frame, 1, 3, 5, 9)
-    assert refusal.value.code == 2
+    assert refusal.value.number == 2
     assert isinstance(refusal.value, InstrumentError)
 
 

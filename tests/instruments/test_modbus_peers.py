@@ -227,7 +227,7 @@ def test_exceptions_of_the_specification(vector: Vector) -> None:
     body = b"\x01" + vector.data
     with pytest.raises(codec.ModbusRefusal) as refused:
         codec.decode_answer("rtu", body + codec.crc16(body), 1, vector.expected["function"], 1)
-    assert refused.value.code == vector.expected["code"]
+    assert refused.value.number == vector.expected["code"]
 
 
 @named("checksum")
