@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from armed import CONTROLLER, PROBE
+from coded import raises
 
 from errormotion.datasets.calibrations.pretravel import PretravelMap, assemble, terms_up_to, unit
 from errormotion.errors import DatasetError, InstrumentError, InstrumentTimeoutError, ProtocolError
@@ -270,7 +271,7 @@ def test_controllers_that_cannot_probe_or_do_not_exist_are_refused() -> None:
         ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, controller="virtul_controller")).open()
     with pytest.raises(InstrumentError, match="colour"):
         ControllerProbe(ADDRESS, ControllerProbeSettings(arm=True, controller_settings={"colour": 1})).open()
-    with pytest.raises(InstrumentError, match="is not open"):
+    with raises("instrument.not_open"):
         ControllerProbe(ADDRESS, PROBE).read()
 
 
@@ -392,5 +393,5 @@ def test_a_position_off_the_path_is_an_error() -> None:
     control.aside = 0.2e-3
     with pytest.raises(InstrumentError, match=r"2\.000 mm along it and 0\.200 mm aside"):
         Toucher(control, ControllerProbeSettings(arm=True).strategy).touch(WAY)
-    with pytest.raises(InstrumentError, match="target differs from its start"):
+    with raises("touch.target.same"):
         Toucher(control, ControllerProbeSettings(arm=True).strategy).touch(Touch((0, 0, 0), (0, 0, 0)))

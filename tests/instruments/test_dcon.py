@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -101,7 +102,7 @@ def test_engineering_units_of_thermocouples_and_resistors_are_read(configuration
 
 @pytest.mark.parametrize("configuration", ["", "10060", "1006000", "1g0600"])
 def test_another_answer_is_not_a_configuration(configuration: str) -> None:
-    with pytest.raises(ProtocolError, match="such as '100600'"):
+    with raises("protocol.reply.form"):
         check_configuration(configuration)
 
 
@@ -129,9 +130,9 @@ def test_zero_degrees_is_not_an_open_sensor() -> None:
     "text", ["", ">", "+025.12", ">025.12", ">+025.12x", ">+025.12 +026.00", ">+025.12      ", "!01"]
 )
 def test_anything_else_is_a_protocol_error(text: str) -> None:
-    with pytest.raises(ProtocolError, match="such as '>"):
+    with raises("protocol.reply.number_form"):
         parse_temperatures(text)
-    with pytest.raises(ProtocolError, match="ASCII"):
+    with raises("protocol.text.form"):
         decode(b"\xff>+025.12\r")
 
 
@@ -214,7 +215,7 @@ def test_a_bad_checksum_is_a_protocol_error_and_splitting_none() -> None:
     settings = DconSettings(checksum=True, timeout=0.3)
     with (
         DconTemperature(f"{ADDRESS}&checksum=1&fault=checksum&fault_at=3", settings) as thermometer,
-        pytest.raises(ProtocolError, match="checksum"),
+        raises("protocol.checksum"),
     ):
         read_often(thermometer, 3)
     with DconTemperature(f"{ADDRESS}&checksum=1&fault=split", settings) as thermometer:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
@@ -85,7 +86,7 @@ def test_one_stream_at_a_time() -> None:
     with FiveSensorFrame(ADDRESS, settings()) as frame:
         stream = frame.stream()
         next(stream)
-        with pytest.raises(InstrumentError, match="already streaming"):
+        with raises("stream.running"):
             frame.stream()
         stream.close()
         assert len(take(frame, 1)) == 1
@@ -230,7 +231,7 @@ def test_five_sensors_need_five_addresses(address: str, message: str) -> None:
 def test_use_before_opening_is_refused_and_opening_is_idempotent() -> None:
     frame = FiveSensorFrame(ADDRESS, settings())
     for use in (frame.read, frame.identify, frame.stream, lambda: frame.warm):
-        with pytest.raises(InstrumentError, match="not open"):
+        with raises("instrument.not_open"):
             use()
     frame.close()
     frame.open()

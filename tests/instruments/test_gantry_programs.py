@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
@@ -97,5 +98,5 @@ def test_a_move_needs_its_kind_and_its_feed() -> None:
 
 
 def test_a_program_that_was_cut_off_is_refused() -> None:
-    with pytest.raises(InstrumentError, match="without M30 or M2; check that it is complete"):
+    with raises("machine.program.no_end"):
         run("G1 Y100 F1500")

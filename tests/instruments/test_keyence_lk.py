@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
@@ -166,7 +167,7 @@ def test_new_settings_apply_from_the_next_reading_on() -> None:
     with KeyenceLK(SIX, PATIENT) as sensor:
         stream = sensor.stream(block=1)
         next(stream)
-        with pytest.raises(InstrumentError, match="is streaming"):
+        with raises("stream.running"):
             sensor.configure(QUICK)
         stream.close()
         sensor.configure(LKSettings(display="0.1 um", set_up="set", rate=10.0))
@@ -458,7 +459,7 @@ def test_a_sensor_that_cannot_keep_the_rate_is_an_error_with_figures(monkeypatch
 def test_use_before_opening_is_refused_and_opening_is_idempotent() -> None:
     sensor = KeyenceLK(SIX)
     for use in (sensor.read, sensor.identify, lambda: next(sensor.stream())):
-        with pytest.raises(InstrumentError, match="not open"):
+        with raises("instrument.not_open"):
             use()
     sensor.close()
     sensor.open()
@@ -474,7 +475,7 @@ def test_closing_in_the_middle_of_a_stream_ends_it() -> None:
     stream = sensor.stream()
     next(stream)
     sensor.close()
-    with pytest.raises(InstrumentError, match="not open"):
+    with raises("instrument.not_open"):
         next(stream)
 
 

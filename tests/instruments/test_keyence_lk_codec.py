@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -168,7 +169,7 @@ def test_a_line_of_other_bytes_is_a_protocol_error(line: bytes) -> None:
     if all(0x20 <= byte < 0x7F for byte in body):
         assert codec.decode(line).encode() == body
     else:
-        with pytest.raises(ProtocolError, match="line of ASCII"):
+        with raises("protocol.text.form"):
             codec.decode(line)
 
 

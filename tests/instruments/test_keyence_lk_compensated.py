@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.datasets.calibrations.inclination import (
     AWAY,
@@ -176,7 +177,7 @@ def test_a_calibration_is_found_by_name_and_by_path(tmp_path: Path, monkeypatch:
 
 
 def test_a_sensor_that_states_no_mid_range_is_refused(known) -> None:
-    with pytest.raises(InstrumentError, match="states the middle of its range"):
+    with raises("sensor.mid_range.missing"):
         CompensatedSensor(object(), known)
 
 

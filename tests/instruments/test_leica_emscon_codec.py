@@ -4,6 +4,7 @@ import importlib
 import struct
 
 import pytest
+from coded import raises
 from emscon_answers import encode_answer, encode_result
 from hypothesis import given
 from hypothesis import strategies as st
@@ -172,13 +173,13 @@ def test_an_unknown_command_is_reported_by_its_number() -> None:
     ],
 )
 def test_invalid_headers_are_reported(header: bytes) -> None:
-    with pytest.raises(ProtocolError, match="Expected the header of an emScon packet"):
+    with raises("protocol.reply.form"):
         codec.decode_header(header)
 
 
 def test_a_packet_that_ends_early_is_refused() -> None:
     data = encode_result(codec.SINGLE, {})
-    with pytest.raises(ProtocolError, match="too short"):
+    with raises("protocol.reply.length"):
         codec.decode_packet(codec.SINGLE, data[8:100])
 
 

@@ -5,6 +5,7 @@ import re
 import tracemalloc
 
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -135,7 +136,7 @@ def test_anything_else_is_a_protocol_error(document: str, message: str) -> None:
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_no_entity_is_ever_expanded(doctype: str, encoding: str) -> None:
     document = f'<?xml version="1.0" encoding="{encoding}"?>{doctype}<a>&x;&b;</a>'
-    with pytest.raises(ProtocolError, match=r"without document type"):
+    with raises("protocol.xml.document_type"):
         parse(document.encode(encoding))
 
 
@@ -229,7 +230,7 @@ def test_data_beyond_their_limit_are_refused(inside: str, message: str, monkeypa
 
 @pytest.mark.parametrize("text", ["1e999", "inf", "nan", "1_0", "0x10", "1" * 200_000 + "x", "\u0661"])
 def test_values_that_only_python_accepts_as_numbers_are_refused(text: str) -> None:
-    with pytest.raises(ProtocolError, match="expected a number"):
+    with raises("protocol.mtconnect.number"):
         Observation("p", 1, 0.0, text).number()
 
 

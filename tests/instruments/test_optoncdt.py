@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
@@ -95,7 +96,7 @@ def test_new_settings_apply_from_the_next_stream_on() -> None:
         assert take(sensor, 1)[0].rate == 30e3
         stream = sensor.stream()
         next(stream)
-        with pytest.raises(InstrumentError, match="is streaming"):
+        with raises("stream.running"):
             sensor.configure(SLOW)
         stream.close()
 
@@ -268,7 +269,7 @@ def test_dropped_samples_are_counted_and_nan_at_their_positions() -> None:
 def test_a_broken_connection_is_an_instrument_error_and_can_be_opened_again() -> None:
     sensor = OptoNCDT("sim://cframe/X1?seed=3&fault=disconnect&fault_at=2000", SLOW)
     with sensor:
-        with pytest.raises(InstrumentError, match="lost"):
+        with raises("connection.lost"):
             take(sensor, 10, block=500)
         sensor.close()
         sensor.open()
@@ -290,7 +291,7 @@ def test_a_fault_that_is_not_on_the_menu_is_refused(fault: str, message: str) ->
 def test_use_before_opening_is_refused_and_opening_is_idempotent() -> None:
     sensor = OptoNCDT("sim://cframe/X1?seed=3", SLOW)
     for use in (sensor.read, sensor.identify, lambda: next(sensor.stream())):
-        with pytest.raises(InstrumentError, match="not open"):
+        with raises("instrument.not_open"):
             use()
     sensor.close()
     sensor.open()
@@ -306,7 +307,7 @@ def test_closing_in_the_middle_of_a_stream_ends_it() -> None:
     stream = sensor.stream()
     next(stream)
     sensor.close()
-    with pytest.raises(InstrumentError, match="no stream is running"):
+    with raises("stream.not_running"):
         next(stream)
 
 
@@ -338,5 +339,5 @@ def test_a_session_that_is_cut_short_fails_in_replay(tmp_path: Path) -> None:
         sensor.read()
     sensor = OptoNCDT(f"replay://{path}", SLOW)
     sensor.open()
-    with pytest.raises(ReplayError, match="stops before the end"):
+    with raises("replay.incomplete"):
         sensor.close()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from optoncdt_by_the_manual import Bench, Bus, Sensor
 from pydantic import ValidationError
 
@@ -76,7 +77,7 @@ def test_the_range_is_the_one_that_the_sensor_reports(millimetres: float) -> Non
     sensor = Sensor("ILD2300", millimetres=millimetres, values=lambda n: 32760)
     with Bench(sensor):
         driver = OptoNCDT(sensor.url, OPTO_2300)
-        with pytest.raises(InstrumentError, match="unknown before it is opened"):
+        with raises("sensor.range.unknown"):
             driver.measuring_range  # noqa: B018
         with driver:
             assert driver.measuring_range == (0.0, pytest.approx(millimetres * 1e-3))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from armed import CONTROLLER
+from coded import raises
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.controller.virtual import VirtualController
@@ -261,7 +262,7 @@ def test_stepping_stops_at_the_present_step() -> None:
 def test_after_a_refusal_the_next_request_is_sent_at_once(
     controller: VirtualController, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InstrumentError, match="controller refuses"):
+    with raises("instrument.refused"):
         controller.mount("nothing like it")
     monkeypatch.setattr(controller, "resynchronise", lambda: pytest.fail("a refusal is an answer: nothing is late"))
     assert controller.state()["alarms"] == []

@@ -11,13 +11,14 @@ from contextlib import closing, contextmanager
 from itertools import pairwise
 
 import pytest
+from coded import raises
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from wire_vectors import Vector, vectors
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.modbus_registers import ModbusRegisters
 from errormotion.instruments.compensator.register_map import RegisterSettings, runs
 from errormotion.instruments.simulators.compensator.plc import SimulatedPlc
@@ -43,7 +44,7 @@ def test_requests_and_answers_of_the_specification(vector: Vector) -> None:
     assert codec.decode_written("tcp", header + answer, 1, *given, 9) == vector.expected["values"]
     assert codec.decode_written("tcp", header + answer, 1, *given, 10) is None  # a late one
     other = answer[:-1] + bytes((answer[-1] ^ 1,))
-    with pytest.raises(ProtocolError, match="Expected the confirmation"):
+    with raises("protocol.modbus.confirmation"):
         codec.decode_written("tcp", header + other, 1, *given, 9)
 
 
@@ -204,7 +205,7 @@ def test_a_limit_that_the_registers_cannot_hold_is_refused() -> None:
     with connected("clock=0&type=i16&scale=1e-9") as (_, compensator):
         with pytest.raises(InstrumentError, match=r"represent offsets from 0.001 um to 32.767 um; the limit is 50 um"):
             compensator.arm(50e-6)
-        with pytest.raises(InstrumentError, match="is not armed"):
+        with raises("instrument.not_armed"):
             compensator.write((0.0, 0.0, 0.0))
         compensator.arm(32e-6)
         compensator.write((32e-6, 0.0, 0.0))

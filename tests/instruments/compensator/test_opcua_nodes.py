@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 pytest.importorskip("asyncua", reason="the package asyncua is not installed")
@@ -284,5 +285,5 @@ def test_invalid_settings_are_refused(settings: dict[str, Any], message: str) ->
 
 
 def test_a_missing_file_with_the_password_is_named(tmp_path) -> None:
-    with pytest.raises(InstrumentError, match="expected a file with the password"):
+    with raises("opcua.password.unreadable"):
         Credentials.read("", "user", str(tmp_path / "none"))

@@ -5,6 +5,7 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 import pytest
+from coded import raises
 
 from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator import owner
@@ -69,7 +70,7 @@ def test_a_second_program_is_refused_until_the_first_has_ended(machine: tuple[An
     with second:
         with pytest.raises(InstrumentError, match=f"their owner is {first._owner.number}, this program is"):
             second.arm(LIMIT)
-        with pytest.raises(InstrumentError, match="not armed"):
+        with raises("instrument.not_armed"):
             second.write((2e-6, 0.0, 0.0))
         assert device.machine.orders == 1
         device.machine.elapse(2 * WATCHDOG)  # the watchdog ends the compensation and the right of the first

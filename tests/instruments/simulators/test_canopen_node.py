@@ -84,7 +84,7 @@ def until(seen, wanted):
 def aborted(action):
     with pytest.raises(SdoAbortedError) as caught:
         action()
-    return caught.value.number
+    return caught.value.code
 
 
 def test_identity_is_read_expedited_and_in_segments():
