@@ -266,7 +266,7 @@ def _finished(solved: Solved, *, record: Record) -> Solved:
     observed, errors = solved.observed, solved.relative.errors
     # There is no redundancy by which the noise could be checked; the batches show it.
     solved = replace(solved, scatter=replace(solved.scatter, note=""))
-    if not observed.reliability:
+    if not solved.propagated:
         return solved
     curves, angle = record.curves, record.angle
     # A range contains the rounding of its two ends
