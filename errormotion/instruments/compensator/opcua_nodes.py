@@ -198,7 +198,7 @@ class OpcUaNodes(Driver):
         ]
         if refused:
             raise InstrumentError(
-                f"{self.address}: the server did not accept {what}: {', '.join(refused)}", code="opcua.write.refused"
+                f"{self.address}: the server did not accept {what}: {', '.join(refused)}", code="opc.write.refused"
             )
 
     def _read_owner(self) -> int:
@@ -207,7 +207,7 @@ class OpcUaNodes(Driver):
         if not math.isfinite(number):
             raise InstrumentError(
                 f"{self.address}: node '{self.settings.owner}' {_reason(found)}; expected the owner",
-                code="opcua.node.no_value",
+                code="opc.node.no_value",
             )
         return int(number)
 
@@ -263,7 +263,7 @@ class OpcUaNodes(Driver):
                 raise InstrumentError(
                     f"{self.address}: node '{node}': expected a number that can be written; found type "
                     f"{array}{kind[:40]}, status {str(each.get('status'))[:60]}, writable {each.get('writable')}",
-                    code="opcua.node.not_writable",
+                    code="opc.node.not_writable",
                 )
         (beat,) = self._values([settings.heartbeat])
         known = _number(beat)
@@ -272,7 +272,7 @@ class OpcUaNodes(Driver):
         for node, value in zip(settings.read, self._values(settings.read), strict=True):
             if value.get("status") != "Good" or not isinstance(value.get("value"), bool | int | float):
                 raise InstrumentError(
-                    f"{self.address}: node '{node}' {_reason(value)}; expected a number", code="opcua.node.no_value"
+                    f"{self.address}: node '{node}' {_reason(value)}; expected a number", code="opc.node.no_value"
                 )
 
 

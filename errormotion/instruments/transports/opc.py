@@ -266,7 +266,7 @@ def _node(client: Client, node: str) -> Any:
     try:
         return client.get_node(ua.NodeId.from_string(node))
     except (UaError, ValueError, TypeError) as error:
-        raise InstrumentError(f"'{text(node)}' is not the id of a node: {error}", code="opcua.node.form") from None
+        raise InstrumentError(f"'{text(node)}' is not the id of a node: {error}", code="opc.node.form") from None
 
 
 def _plain(value: ua.DataValue) -> dict[str, Any]:

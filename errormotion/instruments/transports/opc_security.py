@@ -62,7 +62,7 @@ class Credentials:
         except (OSError, IndexError, UnicodeDecodeError) as error:
             raise InstrumentError(
                 f"password_file '{password_file}': expected a file with the password; {error}",
-                code="opcua.password.unreadable",
+                code="opc.password.unreadable",
             ) from None
         return cls(security, user, password)
 
@@ -89,7 +89,7 @@ async def secure(client: Client, security: str) -> None:
         raise InstrumentError(
             f"'security': expected POLICY,MODE,CERTIFICATE,KEY[,SERVER CERTIFICATE] with the policy "
             f"{', '.join(POLICIES)} and the mode {' or '.join(MODES)}; found '{security}'",
-            code="opcua.security.form",
+            code="opc.security.form",
         )
     certificate = await _certificate(parts[2])
     await _check_key(parts[3])
@@ -103,7 +103,7 @@ async def secure(client: Client, security: str) -> None:
     except UaError as error:
         raise InstrumentError(
             f"'security': the server has no endpoint with policy {parts[0]} and mode {parts[1]}: {error}",
-            code="opcua.security.no_endpoint",
+            code="opc.security.no_endpoint",
         ) from None
 
 
@@ -133,7 +133,7 @@ async def _certificate(path: str) -> Certificate:
         found: Certificate = await uacrypto.load_certificate(path)
     except (OSError, ValueError) as error:
         raise InstrumentError(
-            f"'security': expected a certificate (.pem or .der) in '{path}': {error}", code="opcua.security.certificate"
+            f"'security': expected a certificate (.pem or .der) in '{path}': {error}", code="opc.security.certificate"
         ) from None
     return found
 
@@ -146,5 +146,5 @@ async def _check_key(text: str) -> None:
         await uacrypto.load_private_key(path, password or None)
     except (OSError, ValueError, TypeError) as error:  # TypeError: with a password that is not needed, or without one
         raise InstrumentError(
-            f"'security': expected a private key (.pem or .der) in '{path}': {error}", code="opcua.security.key"
+            f"'security': expected a private key (.pem or .der) in '{path}': {error}", code="opc.security.key"
         ) from None

@@ -285,5 +285,5 @@ def test_invalid_settings_are_refused(settings: dict[str, Any], message: str) ->
 
 
 def test_a_missing_file_with_the_password_is_named(tmp_path) -> None:
-    with raises("opcua.password.unreadable"):
+    with raises("opc.password.unreadable"):
         Credentials.read("", "user", str(tmp_path / "none"))

@@ -191,14 +191,14 @@ class OpcUa(Driver):
             raise InstrumentError(
                 f"The server at {self.address} has no object CncInterface (OPC 40502); state nodes in the settings, "
                 "as in nodes.spindle_speed = 'ns=2;s=/Channel/Spindle/actSpeed[u1,1]'",
-                code="opcua.object.missing",
+                code="opc.object.missing",
             )
         self._factors = {key: self._factor(key) for key in NUMBERS if key in self._nodes}
         for key, value in zip(self._nodes, self._read(list(self._nodes.values())), strict=True):
             if key in self.settings.nodes and value["value"] is None and value.get("status") != "Good":
                 raise InstrumentError(
                     f"nodes.{key} = '{self._nodes[key]}': the server answers {value.get('status')}",
-                    code="opcua.node.no_value",
+                    code="opc.node.no_value",
                 )
 
     def _factor(self, key: str) -> float:

@@ -121,7 +121,7 @@ def factor(key: str, stated: Any, settings: OpcUaSettings) -> float:
             return _scaled({"rpm": "1/min", "r/min": "1/min"}.get(unit, unit), UNITS[name], f"'{key}'")
     raise InstrumentError(
         f"'{key}': the server does not state its unit; state it in the settings: units.{name} = 'mm'",
-        code="opcua.unit.missing",
+        code="opc.unit.missing",
     )
 
 
@@ -132,7 +132,7 @@ def _scaled(unit: str, target: str, what: str) -> float:
         return float(convert(1.0, unit, target))
     except DatasetError as error:
         raise InstrumentError(
-            f"{what}: expected a unit that converts to {target}; found '{unit}' ({error})", code="opcua.unit.other"
+            f"{what}: expected a unit that converts to {target}; found '{unit}' ({error})", code="opc.unit.other"
         ) from None
 
 
@@ -146,11 +146,11 @@ def _one(what: str, found: Mapping[str, str], name: str) -> str:
         if name in found or not found:
             return found.get(name, "")
         raise InstrumentError(
-            f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}", code="opcua.object.unknown"
+            f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}", code="opc.object.unknown"
         )
     if len(found) > 1:
         raise InstrumentError(
             f"The server has several: {what} {', '.join(sorted(found))}; state one in the settings",
-            code="opcua.object.ambiguous",
+            code="opc.object.ambiguous",
         )
     return next(iter(found.values()), "")
