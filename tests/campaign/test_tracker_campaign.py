@@ -74,6 +74,7 @@ def lab(tmp_path, monkeypatch):
     """Return a function that writes bench and campaign; an operator moves the tracker."""
     monkeypatch.setattr(OpenBench, "virtual", property(lambda self: False))
     monkeypatch.delattr(VirtualController, "act")
+    monkeypatch.setattr(VirtualController, "virtual", False)
 
     def write(fault="", **changes):
         text = CAMPAIGN

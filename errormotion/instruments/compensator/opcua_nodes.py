@@ -191,7 +191,7 @@ class OpcUaNodes(Driver):
         if not isinstance(statuses, list) or len(statuses) != len(values):
             raise ProtocolError(
                 f"{self.address}: expected {len(values)} statuses; found {str(statuses)[:80]}",
-                code="protocol.opcua.count",
+                code="protocol.opc.count",
             )
         refused = [
             f"{node}: {str(each)[:60]}" for (node, *_), each in zip(values, statuses, strict=True) if each != "Good"
@@ -227,7 +227,7 @@ class OpcUaNodes(Driver):
         whole = isinstance(answers, list) and len(answers) == len(list(nodes))
         if not whole or not all(isinstance(each, dict) for each in answers):
             raise ProtocolError(
-                f"{self.address}: expected the values of nodes; found {str(answers)[:80]}", code="protocol.opcua.form"
+                f"{self.address}: expected the values of nodes; found {str(answers)[:80]}", code="protocol.opc.form"
             )
         return list(answers)
 
@@ -248,7 +248,7 @@ class OpcUaNodes(Driver):
         found = request(self.transport, {"describe": list(nodes)})
         if not isinstance(found, list) or len(found) != len(nodes) or not all(isinstance(each, dict) for each in found):
             raise ProtocolError(
-                f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}", code="protocol.opcua.form"
+                f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}", code="protocol.opc.form"
             )
         types = [str(each.get("type")) for each in found]
         self._types, self._owner_type = types[:4], types[-1]

@@ -155,7 +155,7 @@ class OpcUaTransport(Transport):
         except Exception as error:  # noqa: BLE001 - the package raises various errors for damaged bytes
             self._drop()
             raise ProtocolError(
-                f"{self.url}: not an answer of an OPC UA server: {error!r}", code="protocol.opcua.form"
+                f"{self.url}: not an answer of an OPC UA server: {error!r}", code="protocol.opc.form"
             ) from None
 
     def _run(self, work: Coroutine[Any, Any, Result]) -> Result:
@@ -204,7 +204,7 @@ class OpcUaTransport(Transport):
                 return await _describe(client, nodes[:MAX_NODES])
             case {"write": list(values)}:
                 return await _write(client, values[:MAX_NODES])
-        raise ProtocolError(f"{self.url}: unknown request {sorted(request)}", code="protocol.opcua.request")
+        raise ProtocolError(f"{self.url}: unknown request {sorted(request)}", code="protocol.opc.request")
 
 
 async def _ended() -> None:
@@ -344,4 +344,4 @@ def request(line: Transport, content: Mapping[str, Any]) -> Any:
     try:
         return json.loads(answer)
     except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"{line.url}: the answer is not JSON: {error}", code="protocol.opcua.form") from None
+        raise ProtocolError(f"{line.url}: the answer is not JSON: {error}", code="protocol.opc.form") from None

@@ -147,7 +147,7 @@ class OpcUa(Driver):
         if not whole or not all(isinstance(each, dict) and {"value", "time"} <= each.keys() for each in answers):
             raise ProtocolError(
                 f"{self.address}: expected the values of {len(nodes)} nodes; found {str(answers)[:80]}",
-                code="protocol.opcua.count",
+                code="protocol.opc.count",
             )
         return list(answers)
 
@@ -155,7 +155,7 @@ class OpcUa(Driver):
         found = request(self.transport, {"browse": node})
         if not isinstance(found, list) or not all(_is_child(each) for each in found):
             raise ProtocolError(
-                f"{self.address}: expected the children of {node}; found {str(found)[:80]}", code="protocol.opcua.form"
+                f"{self.address}: expected the children of {node}; found {str(found)[:80]}", code="protocol.opc.form"
             )
         return found
 
@@ -175,7 +175,7 @@ class OpcUa(Driver):
         if not isinstance(namespaces, list):
             raise ProtocolError(
                 f"{self.address}: expected the namespaces of the server; found {str(server)[:80]}",
-                code="protocol.opcua.form",
+                code="protocol.opc.form",
             )
         root = model.interface(namespaces, self._browse)
         found: dict[str, str] = {}

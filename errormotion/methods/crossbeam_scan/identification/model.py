@@ -227,7 +227,7 @@ class Campaign:
         of_twist = self._of_twist(c)
         rows = x.twist.reshape(len(y), -1, 6)
         strain = np.concatenate([c.scale, c.expansion, c.mount], axis=1)
-        found = y - np.einsum("nmwi,nwi->nm", of_twist, rows)
+        found: Array = y - np.einsum("nmwi,nwi->nm", of_twist, rows)
         found[:, :6] -= c.cold + np.einsum("nij,nj->ni", self.effect.reshape(-1, 6, 4), strain)
         return found
 
@@ -352,7 +352,8 @@ class Campaign:
         ideal.twist[1, known], ideal.covariance[1], ideal.cold_share[1] = 0.0, bound, 0.0
         alone = replace(self, found=ideal, strains=np.zeros(4))
         if self.guide is None or not known.any():
-            return alone.carriage()[1][1].copy()
+            twists: Array = alone.carriage()[1][1].copy()
+            return twists
         covariance: Array = alone.of_registrations(solve(alone.observed(coords={}, reference="")))[1]
         return covariance
 
