@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from errormotion import plugins
+from errormotion.errors import PluginError
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -80,14 +83,25 @@ ALIASES = {
 
 
 def with_present_groups(dataset: xr.Dataset) -> xr.Dataset:
-    """Return an error dataset whose groups of sources have their present names."""
+    """Return an error dataset whose groups of sources have their present names.
+
+    Results of foreign methods keep theirs, which may be the same words.
+    """
     if "source_group" not in dataset.coords:
         return dataset
     group = dataset["source_group"]
     names = [str(name) for name in group.values]
-    if not set(names) & set(ALIASES):
+    if not set(names) & set(ALIASES) or not _of_this_package(str(dataset.attrs.get("method", ""))):
         return dataset
     return dataset.assign_coords(source_group=(group.dims, [present(name) for name in names], group.attrs))
+
+
+def _of_this_package(method: str) -> bool:
+    try:
+        module = str(plugins.get("methods", method).__module__)
+    except PluginError:
+        return False
+    return module.partition(".")[0] == __name__.partition(".")[0]
 
 
 def present(name: str) -> str:

@@ -208,6 +208,8 @@ def errors_of(
             Source(name, constant.group, effect, identity)
             for name, effect, identity in zip(names, effects, identities, strict=True)
         ]
+    unknown = np.isnan(value)
+    own = np.where(unknown[:, :, None] | unknown[:, None, :], np.nan, own)
     return Errors(value, own, found)
 
 

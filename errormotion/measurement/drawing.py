@@ -88,11 +88,16 @@ def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[
     true = moved(problem, problem.readings, drawn, priors=False)
     y = _consistent(true, exact, drawn)
     measured = _recorded(observed, raw, y, generator)
-    # Errors may depend on the constants themselves, such as a lever.
-    linear = replace(exact.fit.linear, problem=replace(true, noise=exact.fit.problem.noise))
-    drawn_errors = errors_of(replace(exact.fit, linear=linear), observed.places, shared=observed.shared)
-    exact = replace(exact, relative=related(observed, drawn_errors))
     truth = dataset(model, exact, raw, info, provenance.make(settings, None, None, steps=["simulation"], seed=seed))
+    # Errors may depend on the constants themselves, such as a lever: the truth has those that were drawn.
+    linear = replace(exact.fit.linear, problem=replace(true, noise=exact.fit.problem.noise))
+    stated, drawn_errors = (
+        related(observed, errors_of(fit, observed.places, sources=False)).errors.value
+        for fit in (exact.fit, replace(exact.fit, linear=linear))
+    )
+    errors = exact.relative.errors
+    shifted = replace(errors, value=errors.value + (drawn_errors - stated))
+    truth = replaced(truth, values_of(replace(exact, relative=replace(exact.relative, errors=shifted))))
     zero = truth.copy()
     for key in ("covariance", "influence", "deviation_variance", "deviation_influence"):
         if key in zero:

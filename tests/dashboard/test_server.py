@@ -133,7 +133,12 @@ def test_the_figure_follows_the_functional_point(open_to_this_computer: Any, key
         status, found = figure(**wrong)
         assert status == 400
         assert "expected" in found["error"]
-        assert found["code"] in ("request.point.form", "request.index.outside", "errors.point.form")
+        assert found["code"] in (
+            "request.number.form",
+            "request.point.form",
+            "request.index.outside",
+            "errors.point.form",
+        )
 
 
 def test_values_and_data_are_sent_whole(open_to_this_computer: Any, runs: Path, key: str) -> None:

@@ -50,7 +50,7 @@ def test_stored_results_with_earlier_names_are_read(tmp_path: Path) -> None:
         frame="machine",
         functional_point=[0.0, 0.0, 0.0],
         reference="commanded",
-        method="own",
+        method="multilateration",
         method_version="1",
         provenance={},
         influence=np.full((3, 3, 6), 1e-7),

@@ -42,7 +42,7 @@ def inverted(machine, data):
             way = there[:, ball] - centre[:, None]
             normal = way / np.linalg.norm(way, axis=-1, keepdims=True)
             flat = normal.reshape(-1, 3)
-            reach = machine._reach(balls, np.full(len(flat), ball), flat).reshape(normal.shape[:2])
+            reach = machine._contact_distance(balls, np.full(len(flat), ball), flat).reshape(normal.shape[:2])
             left = np.einsum("cti,cti->ct", way, normal) - reach
             step = np.stack([np.linalg.lstsq(n, x)[0] for n, x in zip(normal, left, strict=True)])
             centre = centre + step

@@ -80,14 +80,19 @@ def _with_nan(values: Array, settings: ProfileFileSettings, path: Path) -> Array
         A number that instruments write for no value stands far from all heights, and the settings do not state it.
     """
     if settings.no_value is not None:
-        stated = (settings.no_value, float(np.float32(settings.no_value)))
+        with np.errstate(over="ignore"):
+            stated = (settings.no_value, float(np.float32(settings.no_value)))
         return np.where(np.isin(values, stated), np.nan, values)
     known = np.unique(values[np.isfinite(values)])
     for extreme, rest in ((known[:1], known[1:]), (known[-1:], known[:-1])):
         # Such a number lies outside of the heights by many times their range, and repeats or has only nines.
-        if rest.size < 2 or np.abs(extreme - rest).min() < _FAR * np.ptp(rest):
+        with np.errstate(over="ignore"):
+            if rest.size < 2:
+                continue
+            near = np.abs(extreme - rest).min() < _FAR * np.ptp(rest)
+            number = float(np.float32(extreme[0]))
+        if near:
             continue
-        number = float(np.float32(extreme[0]))
         if (values == extreme[0]).sum() > 1 or _NINES.fullmatch(f"{number:.7g}"):
             raise InstrumentError(
                 f"{path}: {number:.7g} is far from all other heights; if it stands for no value, set 'no_value'",
