@@ -48,7 +48,7 @@ _FALSE_NOTE = 0.01
 """Probability of a note on a correlation of white noise."""
 _FEW = 8.0
 """Independent readings below which the size of a correlated noise is hardly known."""
-_NOTHING = 1e-3
+_NOTHING = 0.03
 """Scatter, relative to a stated noise, below which readings are expected ones and say nothing about their noise."""
 _COARSE = 0.5
 """Noise in steps of the scale from which rounding is a part of the scatter."""

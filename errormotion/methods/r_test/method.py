@@ -78,7 +78,6 @@ class RTest(ModelMethod):
         problem = _problem(raw, layout)
         _check_sense(raw, problem)
         known = np.where(layout.determined, 0.0, np.nan)
-        angle, sphere, sensor = (index.ravel() for index in np.indices(layout.reading.shape))
         lines = {name: k for name, k in layout.locations.items() if layout.seen[k]}
         # The line of the axis displaced by +1 displaces the table by +1: an error motion of -1 (tool relative to it).
         shift = [np.tile(-np.eye(6)[k], (len(layout.angle), 1)) for k in lines.values()]
@@ -87,8 +86,6 @@ class RTest(ModelMethod):
             places=Places(lambda x, _: x.motion + known, len(layout.angle)),
             datum=Datum(np.stack([*shift, *layout.gauge[1]], axis=2), ~np.isnan(known), LINE, tuple(lines)),
             recorded=("displacement", ("angle", "sphere", "sensor")),
-            order=angle.astype(float),
-            series=sphere * layout.reading.shape[2] + sensor,
             suspects=_suspects(layout, problem),
             name=layout.name_of,
             refuses_contradictions=True,
