@@ -107,7 +107,7 @@ class Result:
         observed = replace(observed, attributes={**observed.attributes, "reference_sources": names})
         if solved.propagated and not self._brief:
             found = self._iso(errors)
-            extras = self._extras(solved.fit.residual[:-1].T) | found.as_extras(len(sources))
+            extras = self._extras(solved.fit.residual[:-1].T) | found.as_extras(self._on_axis(errors))
             attrs = {**observed.attrs, "iso_test": found.test, "iso_temperature_sensor": found.sensor}
             observed = replace(observed, extras=extras, attrs=attrs)
         # The noise is checked by its scatter over time, not by the residuals, of which there are none.
@@ -130,10 +130,13 @@ class Result:
             for k, name in enumerate(CHANNELS)
         ]
 
+    def _on_axis(self, errors: Errors) -> NDArray[np.bool_]:
+        """Whether each source affects the values of ISO 230-3, which are those on the axis of the bar, (s,)."""
+        return np.array([source.group != self.off_axis for source in errors.sources], dtype=bool)
+
     def _iso(self, errors: Errors) -> iso230_3.Results:
         record, settings = self.record, self.settings
-        on_axis = sum(source.group != self.off_axis for source in errors.sources)  # the others are last
-        influence = errors.influence[:on_axis]
+        influence = errors.influence[self._on_axis(errors)]
         E0, point = self.state[-1, :3], self.point
         return iso230_3.evaluate(
             iso230_3.quantities(errors.value, errors.own, influence, self.setup.levels - point[2], E0 - point),

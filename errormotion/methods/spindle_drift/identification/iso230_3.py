@@ -101,8 +101,8 @@ class Results:
     sensor: str
     series: Series
 
-    def as_extras(self, sources: int) -> dict[str, xr.DataArray]:
-        """Return the values as further variables of an error dataset with ``sources``; the last ones have no effect.
+    def as_extras(self, on_axis: NDArray[np.bool_]) -> dict[str, xr.DataArray]:
+        """Return the values as further variables of an error dataset, ``on_axis``: which of its sources affect them.
 
         Their coordinates are `LABELS`.
         """
@@ -110,8 +110,8 @@ class Results:
         units = {"units": "SI: m or rad; s for time_constant; per s for end_slope; per K for per_kelvin"}
         shared = np.einsum("skt,skt->kt", self.series.influence, self.series.influence)
         u = np.sqrt(shared + self.series.variance)
-        F = np.zeros((sources, *self.value.shape))
-        F[: len(self.influence)] = self.influence
+        F = np.zeros((len(on_axis), *self.value.shape))
+        F[on_axis] = self.influence
 
         def by_level(values: Array) -> xr.DataArray:
             by_place = values[[0, 2, 1, 3]].reshape(2, 2, -1)  # X1 Y1 at L1, X2 Y2 at L2
