@@ -8,6 +8,7 @@ SUBJECTS = subjects()
 
 class TestCrossbeamScan(MethodConformance):
     subject = SUBJECTS[0]
+    test_figures = None  # none follows from the errors alone
 
 
 class TestCrossbeamScanSecond(MethodConformance):
@@ -16,3 +17,4 @@ class TestCrossbeamScanSecond(MethodConformance):
 
 class TestCrossbeamScanThird(MethodConformance):
     subject = SUBJECTS[2]
+    test_figures = None  # none follows from the errors alone

@@ -11,8 +11,10 @@ SUBJECTS = subjects()
 @pytest.mark.slow
 class TestFiveSensors(MethodConformance):
     subject = SUBJECTS[0]
+    test_figures = None  # none follows from the errors alone
 
 
 @pytest.mark.slow
 class TestHorizontalSpindle(MethodConformance):
     subject = SUBJECTS[1]
+    test_figures = None  # none follows from the errors alone
