@@ -12,7 +12,7 @@ from errormotion.methods.circular_test import CircularTest, Settings, figures, p
 from errormotion.methods.circular_test.path import PARAMETERS, TYPICAL
 
 SMALL = Settings(samples=540, places=60)
-SEEDS = 100
+SEEDS = 150
 FALSE_ALARM = 1e-3
 R, V = 0.15, 1 / 60
 NAMES = figures.NAMES
