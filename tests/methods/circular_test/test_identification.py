@@ -108,7 +108,7 @@ def test_intervals_of_the_figures_hold_the_truth(ratios):
     held = (np.abs(ratios["figures"]) <= 2).sum(axis=0)
     low = stats.binom.ppf(FALSE_ALARM / 7, SEEDS, 0.95)
     assert dict(zip(NAMES, held >= low, strict=True)) == dict.fromkeys(NAMES, True)
-    # The uncertainty is not much too large; G of the second direction, whose extreme is one spike, has 0.38.
+    # The uncertainty is not much too large; that of H is the largest, with 0.38.
     assert (np.mean(ratios["figures"] ** 2, axis=0) > 0.35).all()
 
 
