@@ -121,7 +121,7 @@ def identify(path: str, strain: str) -> None:
     """Identify a campaign and print time and memory as JSON; runs in a separate process."""
     from errormotion.datasets import load, provenance
     from errormotion.methods.crossbeam_scan import CrossbeamScan
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
     raw, hashing = load(path), [0.0]
     hash_dataset = provenance.hash_dataset
@@ -134,7 +134,7 @@ def identify(path: str, strain: str) -> None:
 
     provenance.hash_dataset = timed
     before, start, used = peak_memory(), time.perf_counter(), time.process_time()
-    errors = CrossbeamScan().identify(raw, Settings(strain=strain))
+    errors = CrossbeamScan().identify(raw, CrossbeamScanSettings(strain=strain))
     answer = {"seconds": time.perf_counter() - start, "processor": time.process_time() - used, "peak": peak_memory()}
     answer |= {"hash": hashing[0], "before": before}
     start = time.perf_counter()

@@ -43,10 +43,10 @@ def make(size: int, folder: Path) -> None:
 def identify(folder: Path, *, plain: bool) -> dict[str, float]:
     """Identify the stored data; return time, memory and the share of errors within their 95 % intervals."""
     from errormotion import datasets
-    from errormotion.methods.multilateration import Multilateration, Settings, simulation
+    from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
     from errormotion.twin import VirtualMachine
 
-    method, settings = Multilateration(), Settings(parametric=not plain)
+    method, settings = Multilateration(), MultilaterationSettings(parametric=not plain)
     machine = VirtualMachine("cframe", seed=3)
     method.identify(simulation.raw(machine, simulation.target_grid(machine, SMALL), seed=2), settings)  # compiles
     raw = datasets.load(folder / "raw.nc")

@@ -13,7 +13,7 @@ import logging
 
 import numpy as np
 
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.twin import VirtualMachine
 
 COORDINATES = ("EX", "EY", "EZ")
@@ -27,7 +27,7 @@ CASES = (
 )  # true repeatability, returns, stated repeatability and its uncertainty
 
 
-def one(seed: int, true: float, returns: int, settings: Settings) -> tuple[float, float, float]:
+def one(seed: int, true: float, returns: int, settings: MultilaterationSettings) -> tuple[float, float, float]:
     """Return the share within 95 % of one machine, the estimated repeatability and its uncertainty, m."""
     machine = VirtualMachine("cframe", seed=seed)
     q = simulation.target_grid(machine, (4, 4, 3))
@@ -49,7 +49,7 @@ def main() -> None:
     logging.disable()
     print("true/um  returns  stated/um        found/um  its u/um  within 95 %")
     for true, returns, stated, uncertain in CASES:
-        settings = Settings(parametric=False, repeatability=stated, repeatability_uncertainty=uncertain)
+        settings = MultilaterationSettings(parametric=False, repeatability=stated, repeatability_uncertainty=uncertain)
         each = np.array([one(seed, true, returns, settings) for seed in range(machines)])
         words = "-" if stated is None else f"{stated * 1e6:.1f} +- {uncertain * 1e6:.1f}"
         found = "-" if np.isnan(each[0, 1]) else f"{each[:, 1].mean() * 1e6:.2f} +- {each[:, 1].std() * 1e6:.2f}"

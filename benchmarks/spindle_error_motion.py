@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from errormotion import datasets
-from errormotion.methods.spindle_error_motion import Settings, SpindleErrorMotion
+from errormotion.methods.spindle_error_motion import SpindleErrorMotion, SpindleErrorMotionSettings
 from errormotion.methods.spindle_error_motion.simulation import expected
 
 SPEED = 3000.0
@@ -24,7 +24,7 @@ SPEED = 3000.0
 def evaluate(path: str) -> None:
     """Print the times and the memory of an identification, which is compiled before."""
     method = SpindleErrorMotion()
-    method.identify(method.simulate(Settings(turns=30, sample_rate=3000.0), 0)[0])
+    method.identify(method.simulate(SpindleErrorMotionSettings(turns=30, sample_rate=3000.0), 0)[0])
     raw = datasets.load(path)
     seconds = raw.sizes["time"] / 50_000
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -49,7 +49,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "spindle.zarr"
         turns = max(int(options.seconds * SPEED / 60), 20)
-        datasets.save(expected(Settings(turns=turns, sample_rate=50_000.0, spindle_speed=SPEED)), path)
+        datasets.save(
+            expected(SpindleErrorMotionSettings(turns=turns, sample_rate=50_000.0, spindle_speed=SPEED)), path
+        )
         subprocess.run([sys.executable, __file__, "--evaluate", str(path)], check=True)
 
 

@@ -27,7 +27,7 @@ autodoc_typehints = "none"  # the docstrings say type, shape and unit
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
-suppress_warnings = ["ref.python"]  # every plugin has a Settings of its own: that name alone is no link
+suppress_warnings = ["ref.python"]  # every plugin class has an attribute Settings: that name alone is no link
 
 html_theme = "furo"
 html_title = f"errormotion {release}"

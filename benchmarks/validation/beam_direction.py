@@ -11,7 +11,7 @@ import numpy as np
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import error_jacobian
-from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
+from errormotion.methods.beam_direction import BeamDirection, BeamDirectionSettings, simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.twin import VirtualMachine
 
@@ -55,7 +55,7 @@ def section(seeds: int) -> Iterator[str]:
 def honesty(seeds: int, rotations: tuple[int, ...]) -> list[str]:
     """Spread against the bound and coverage by freedom, every seed another machine."""
     planes = [(INCLINATION, np.radians(b)) for b in rotations]
-    method, settings = BeamDirection(), Settings(noise="stated")
+    method, settings = BeamDirection(), BeamDirectionSettings(noise="stated")
     miss, stated, bound, chi2 = [], [], [], []
     for seed in range(seeds):
         machine = VirtualMachine("cframe", seed=seed)
@@ -129,7 +129,7 @@ def compensation(seeds: int) -> list[str]:
             for pair in PAIRS:
                 planes = [(INCLINATION, np.radians(b)) for b in pair]
                 raw = simulation.raw(machine, planes, seed=seed, speckle=True)
-                errors = method.identify(raw, Settings(compensation=str(everywhere), noise="stated"))
+                errors = method.identify(raw, BeamDirectionSettings(compensation=str(everywhere), noise="stated"))
                 before, after = (errors[f"{name}direction"].values[0] for name in ("uncompensated_", "beam_"))
                 lean[pair].append([np.arccos(-u[2]) - np.arccos(-true[2]) for u in (before, after)])
                 turn[pair].append([np.linalg.norm(np.cross(u, true)) for u in (before, after)])
@@ -137,7 +137,7 @@ def compensation(seeds: int) -> list[str]:
                 stated[pair].append(miss / np.sqrt(np.diag(errors["covariance"].values[0]))[3:])
                 if seed == 0:
                     try:
-                        method.identify(raw, Settings(compensation=str(published)))
+                        method.identify(raw, BeamDirectionSettings(compensation=str(published)))
                     except MethodError:
                         refused[pair] = 1
     rows = [

@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration
 from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
 from errormotion.methods.crossbeam_scan.identification.registrations import FEED as FEED_NAMES
 from errormotion.methods.crossbeam_scan.identification.registrations import bound
-from errormotion.methods.crossbeam_scan.settings import Layout, PoseSettings, Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings, Layout, PoseSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
 from errormotion.twin.crossbeam import LEVER, LIFT
@@ -86,7 +86,9 @@ def campaign(seed: int) -> Seed:
     """Return deviations of a campaign and their stated covariance: pose, errors, errors at the tool, curves."""
     machine = VirtualMachine("gantry", seed=seed)
     beam = machine.crossbeam
-    posed = METHOD.identify(simulation.raw_pocket(machine, seed=10_000 + seed), Settings(procedure="profiler_pose"))
+    posed = METHOD.identify(
+        simulation.raw_pocket(machine, seed=10_000 + seed), CrossbeamScanSettings(procedure="profiler_pose")
+    )
     pose, covariance = posed["profiler_pose"].values, posed["pose_covariance"].values
     true_pose, found_pose = (parameters(RigidTransform.from_matrix(matrix)) for matrix in (beam.pose, pose))
     out = {"pose": found_pose - true_pose, "pose_covariance": covariance}
@@ -101,7 +103,7 @@ def campaign(seed: int) -> Seed:
     raw["lever_uncertainty"] = ("direction", np.full(3, LEVER_SIGMA), metres)
     truth = simulation.truth_axis(machine, TIMES, PLACES)
     for strain in STRAINS:
-        errors = METHOD.identify(raw, Settings(strain=strain, **RIGID))
+        errors = METHOD.identify(raw, CrossbeamScanSettings(strain=strain, **RIGID))
         for name, ours, true in (("", errors, truth), ("_tool", errors.em.at(TOOL), truth.em.at(TOOL))):
             out[f"{strain}{name}"] = (ours.em.twist().values - true.em.twist().values)[1:]
             out[f"{strain}{name}_covariance"] = ours["covariance"].values[1:]
@@ -188,7 +190,7 @@ def curves_table(found: Seed) -> Iterable[str]:
 
 def pose_table(found: Seed) -> Iterable[str]:
     """Return coverage and efficiency of the pose of the profiler."""
-    expected = METHOD.plan(Settings(procedure="profiler_pose", profiler_pose=PoseSettings(dz=LIFT)))
+    expected = METHOD.plan(CrossbeamScanSettings(procedure="profiler_pose", profiler_pose=PoseSettings(dz=LIFT)))
     bounds = np.sqrt(np.diagonal(expected["covariance"].values[0]))[[3, 4, 5, 0, 1, 2]]
     error, u = found["pose"], np.sqrt(np.diagonal(found["pose_covariance"], axis1=-2, axis2=-1))
     yield (

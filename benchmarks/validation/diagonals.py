@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 
 TITLE = "Diagonals of a volume"
 SEEDS = 1000
@@ -38,7 +38,9 @@ def section(seeds: int) -> Iterator[str]:
 
 def row(runs: int, seeds: int) -> str:
     """Return one row of the table."""
-    settings = Settings.model_validate({"diagonals": {"names": NAMES}, "count": 5, "runs": runs, "trials": 400})
+    settings = LinearPositioningSettings.model_validate(
+        {"diagonals": {"names": NAMES}, "count": 5, "runs": runs, "trials": 400}
+    )
     method = LinearPositioning()
     inside, largest, square, sizes = [], [], [], []
     for seed in range(seeds):

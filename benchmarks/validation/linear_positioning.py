@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.identification import standard
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, Statistics
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
@@ -14,7 +14,7 @@ from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and
 TITLE = "Linear positioning"
 SEEDS = 1000
 Z95 = 1.959964
-SETTINGS = Settings(trials=1000)
+SETTINGS = LinearPositioningSettings(trials=1000)
 BEHAVIOURS = {
     "usual: scatter 0.3 um, drift 0.4 um, reversal 1.5 um": Behaviour(),
     "drifting: scatter 0.2 um, drift 1 um and 1 um in slope": Behaviour(0.2e-6, 1e-6, 1e-6, 0.5e-6),

@@ -12,7 +12,7 @@ from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.machines import Machine
 from errormotion.kinematics.twists import move, rigid_motions
 from errormotion.kinematics.volumes import AxisErrors, Targets, Volume, first_order, fitted, is_rotation
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.methods.multilateration.axes import grid, volumetric_errors
 from errormotion.methods.multilateration.networks import bound
 from errormotion.methods.multilateration.simulation import NOISE, REFLECTOR
@@ -28,7 +28,9 @@ SCALE = 0.3e-6
 REFERENCE = np.array(REFLECTOR)
 #: the virtual tracker has no error of scale, and measures lengths in the air as they are
 NO_AIR = dict.fromkeys(("temperature", "pressure", "humidity", "wavelength"), 0.0)
-EXACT_SCALE = Settings(scale_uncertainty=0.0, air={f"{name}_uncertainty": value for name, value in NO_AIR.items()})
+EXACT_SCALE = MultilaterationSettings(
+    scale_uncertainty=0.0, air={f"{name}_uncertainty": value for name, value in NO_AIR.items()}
+)
 
 
 def section(seeds: int) -> Iterator[str]:
@@ -51,7 +53,10 @@ def vectors(ds) -> np.ndarray:
 
 def honesty(seeds: int) -> list[str]:
     """Spread against the bound and coverage, every seed another machine."""
-    method, settings = Multilateration(), Settings(noise="stated", scale_uncertainty=SCALE, parametric=False)
+    method, settings = (
+        Multilateration(),
+        MultilaterationSettings(noise="stated", scale_uncertainty=SCALE, parametric=False),
+    )
     z, station_z, spread, chi2, station_spread, lost = [], [], [], [], [], 0
     for seed in range(seeds):
         machine = VirtualMachine("cframe", seed=seed)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.normal_vector import NormalVector, Settings, simulation
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings, simulation
 from errormotion.methods.normal_vector.identification.freedoms import Motion
 from errormotion.twin import Event, VirtualMachine
 
@@ -88,7 +88,7 @@ def least(machine: VirtualMachine, errors, raw) -> np.ndarray:
 
 def honesty(kind: str, seeds: int) -> tuple[list[str], str]:
     """Spread against the bound and coverage, every seed another machine."""
-    method, settings = NormalVector(), Settings(noise="stated")
+    method, settings = NormalVector(), NormalVectorSettings(noise="stated")
     z, spread, stated, loss, lost, largest, alarms = [], [], [], [], [], [], 0
     for seed in range(seeds):
         for draw in range(DRAWS):
@@ -133,7 +133,7 @@ def wrong(seeds: int) -> list[str]:
     for seed in range(seeds):
         machine, raw = probed("cframe", seed)
         del raw.attrs["tool_axes"]
-        errors = NormalVector().identify(raw, Settings(tool_axes="XYZ", robust=False))
+        errors = NormalVector().identify(raw, NormalVectorSettings(tool_axes="XYZ", robust=False))
         named += any("scatter" in note for note in errors.attrs["notes"])
         ratio.append(float(errors["noise"]) / float(raw["touch_noise"]))
         off_by.append((vectors(errors) - off(machine, errors))[-1])

@@ -9,7 +9,7 @@ import xarray as xr
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 
 TITLE = "R-test"
 SEEDS = 300
@@ -23,7 +23,7 @@ def section(seeds: int) -> Iterator[str]:
     yield from ("", "### One sphere on the axis", "", *one_sphere(seeds), "", "### Faults", "", *faults(seeds // 6))
 
 
-def outcomes(settings: Settings, seeds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def outcomes(settings: RTestSettings, seeds: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return deviations and standard uncertainties of motions (seed, angle, 6) and of location errors (seed, 4)."""
     rows: list[list[np.ndarray]] = [[], [], [], []]
     for seed in range(seeds):
@@ -37,7 +37,7 @@ def outcomes(settings: Settings, seeds: int) -> tuple[np.ndarray, np.ndarray, np
     return off, u, line, v
 
 
-def table(settings: Settings, seeds: int) -> list[str]:
+def table(settings: RTestSettings, seeds: int) -> list[str]:
     """Return the coverage of every freedom over all angles, and of the location errors."""
     off, u, line, v = outcomes(settings, seeds)
     names = METHOD.expected(settings).attrs["axis"]
@@ -67,7 +67,7 @@ def _row(name: str, off: np.ndarray, u: np.ndarray, length: bool) -> str:
 
 def coverage(seeds: int) -> list[str]:
     """Coverage with the default test: every source of its budget is drawn for each seed."""
-    settings = Settings()
+    settings = RTestSettings()
     chance = np.sqrt(0.05 * 0.95 / seeds)
     return [
         f"{seeds} simulated tests of a table C: {settings.angles} angles, {settings.spheres} spheres on a circle of "
@@ -82,12 +82,12 @@ def coverage(seeds: int) -> list[str]:
 
 def one_sphere(seeds: int) -> list[str]:
     """Coverage with a sphere on the axis, which has no redundancy."""
-    settings = Settings(spheres=1, axis="A", angles=24)
+    settings = RTestSettings(spheres=1, axis="A", angles=24)
     text = f"{seeds} simulated tests of a table A with {settings.angles} angles; rotations are not determined."
     return [text, "", *table(settings, seeds)]
 
 
-def bound(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def bound(settings: RTestSettings) -> tuple[np.ndarray, np.ndarray]:
     """Return the Cramer-Rao bounds of error motions (angle, 6) and location errors (4,), from dense matrices.
 
     All unknowns at once: 6 a angle, 3 a sphere. The datum is a projection of the error motions.
@@ -123,7 +123,7 @@ def bound(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
 
 def efficiency(seeds: int) -> list[str]:
     """Spread against the bound, with all constants known."""
-    settings = Settings(gain_uncertainty=0, direction_uncertainty=0, nest_uncertainty=0, position_uncertainty=0)
+    settings = RTestSettings(gain_uncertainty=0, direction_uncertainty=0, nest_uncertainty=0, position_uncertainty=0)
     off, u, line, v = outcomes(settings, seeds)
     motion, location = bound(settings)
     rows = ["| error | bound (k = 1) | spread/bound | stated/bound |", "|---|---|---|---|"]
@@ -188,7 +188,7 @@ def faults(seeds: int) -> list[str]:
         noted = named = 0
         inside: list[np.ndarray] = []
         for seed in range(seeds):
-            raw, truth = METHOD.simulate(Settings(spheres=4 if fault.startswith("four") else 3), seed)
+            raw, truth = METHOD.simulate(RTestSettings(spheres=4 if fault.startswith("four") else 3), seed)
             try:
                 errors = METHOD.identify(plant(raw.copy(deep=True)))
             except MethodError as error:

@@ -9,7 +9,7 @@ import xarray as xr
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.spindle_error_motion import Settings, SpindleErrorMotion
+from errormotion.methods.spindle_error_motion import SpindleErrorMotion, SpindleErrorMotionSettings
 from errormotion.methods.spindle_error_motion.simulation import simulate, truth_of
 from errormotion.twin.spindle import Spindle
 
@@ -17,7 +17,7 @@ TITLE = "Spindle error motions"
 SEEDS = 200
 Z95 = 1.959964
 METHOD = SpindleErrorMotion()
-SMALL = Settings(turns=64, sample_rate=5000.0, places=60, harmonics=15)
+SMALL = SpindleErrorMotionSettings(turns=64, sample_rate=5000.0, places=60, harmonics=15)
 
 
 def section(seeds: int) -> Iterator[str]:
@@ -26,7 +26,7 @@ def section(seeds: int) -> Iterator[str]:
     yield from ("", "### Records as they are", "", *records(max(seeds // 4, 10)))
 
 
-def outcomes(settings: Settings, seeds: int) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
+def outcomes(settings: SpindleErrorMotionSettings, seeds: int) -> tuple[np.ndarray, np.ndarray, list[str], np.ndarray]:
     """Return deviations and standard uncertainties (seed, angle, 6), names of values, and (seed, value, 2) of them."""
     off, u, names, values = [], [], list[str](), []
     for seed in range(seeds):
@@ -40,7 +40,7 @@ def outcomes(settings: Settings, seeds: int) -> tuple[np.ndarray, np.ndarray, li
     return np.array(off), np.array(u), names, np.array(values)
 
 
-def coverage(settings: Settings, seeds: int) -> list[str]:
+def coverage(settings: SpindleErrorMotionSettings, seeds: int) -> list[str]:
     """Coverage of errors over all angles, and of the values, with every source drawn for each seed."""
     off, u, names, values = outcomes(settings, seeds)
     known = np.isfinite(off)

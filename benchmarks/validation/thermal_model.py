@@ -10,7 +10,7 @@ import numpy as np
 
 from errormotion.compensation.thermal_model import check, fit
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.normal_vector import NormalVector, Settings, simulation
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings, simulation
 from errormotion.twin import Event, VirtualMachine
 
 TITLE = "Thermal model"
@@ -66,7 +66,7 @@ def judged(kind: str, seeds: int) -> tuple[list[str], str]:
             events = [Event(60.0 * at, float(speed), OFF if i == 0 else None) for i, (at, speed) in enumerate(profile)]
             machine.start(events)
             raw = simulation.raw(machine, BEGINS, seed=10 * seed + number, cycle=CYCLE)
-            campaigns.append(method.identify(raw, Settings(noise="stated", functional_point=POINTS[kind])))
+            campaigns.append(method.identify(raw, NormalVectorSettings(noise="stated", functional_point=POINTS[kind])))
         model = fit(campaigns[:2])
         found = check(model, campaigns[2])
         truth = machine.truth_probing(campaigns[2]["time"].values, campaigns[2].attrs["functional_point"])

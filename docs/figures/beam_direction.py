@@ -17,7 +17,7 @@ from errormotion.kinematics.beams import across
 from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.methods.beam_direction.identification.check_bar.measure import measure_bar
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.twin import VirtualMachine
 
 BLUE, ORANGE, GREY = "#1f5a96", "#d9822b", "#8a8f98"
@@ -33,7 +33,7 @@ def measured(machine: VirtualMachine, folder: Path) -> tuple[list, list]:
     faces = [(np.radians(a), np.radians(b)) for a, b in FACES]
     raws = [simulation.raw(machine, faces, seed=seed, speckle=True) for seed in SEEDS]
     method = BeamDirection()
-    with_it, without = (Settings(compensation=name) for name in (str(folder / "lk-h050.nc"), None))
+    with_it, without = (BeamDirectionSettings(compensation=name) for name in (str(folder / "lk-h050.nc"), None))
     return [method.identify(raw, with_it) for raw in raws], [method.identify(raw, without) for raw in raws]
 
 

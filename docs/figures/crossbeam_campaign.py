@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 
 from errormotion.datasets import DOF
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Profiler
 
@@ -38,7 +38,7 @@ def measured(machine: VirtualMachine) -> xr.Dataset:
         pose_covariance=(("p", "p_"), pose["pose_covariance"].values),
         lever_uncertainty=("direction", np.full(3, 1e-3), {"units": "m"}),
     )
-    return method.identify(raw, Settings(strain="guided"))
+    return method.identify(raw, CrossbeamScanSettings(strain="guided"))
 
 
 def truth(machine: VirtualMachine, seconds, place, point) -> np.ndarray:

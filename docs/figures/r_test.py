@@ -9,7 +9,7 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 
 BLUE, ORANGE, GREY = "#1f5a96", "#d9822b", "#8a8f98"
 
@@ -38,7 +38,7 @@ def draw_setup(ax) -> None:
 
 def main() -> None:
     """Simulate, identify and draw."""
-    method, settings = RTest(), Settings()
+    method, settings = RTest(), RTestSettings()
     raw, truth = method.simulate(settings, 4)
     errors = method.identify(raw, settings)
     angle = np.degrees(errors["angle"].values)

@@ -30,7 +30,7 @@ class Known(NamedTuple, Generic[T]):
     expansion: T
 
 
-class Settings(PluginSettings):
+class ReferenceTouchesSettings(PluginSettings):
     """The test to plan or to simulate; an identification needs only the functional point."""
 
     interval: float = Field(300.0, gt=0, description="time between two series of touches, s")
@@ -51,7 +51,7 @@ class ReferenceTouches(ModelMethod):
         cannot_see=("rotations", "a displacement of the reference on the table: it counts as drift of the tool"),
     )
     needs = Needs(instruments=(), raw_schema=SCHEMA)
-    Settings = Settings
+    Settings = ReferenceTouchesSettings
     raw_schemas = (
         RawSchema(
             SCHEMA,
@@ -72,7 +72,7 @@ class ReferenceTouches(ModelMethod):
         ),
     )
 
-    def observe(self, raw: xr.Dataset, settings: Settings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: ReferenceTouchesSettings) -> Observed:
         """Return the model: a machine that is too far by E shows E less where it touches the reference."""
         y = raw["touch"].transpose(*READINGS).sel(direction=["x", "y", "z"]).values
         time, axis, _ = (index.ravel() for index in np.indices(y.shape))
@@ -105,7 +105,7 @@ class ReferenceTouches(ModelMethod):
             what="the touches",
         )
 
-    def expected(self, settings: Settings) -> xr.Dataset:
+    def expected(self, settings: ReferenceTouchesSettings) -> xr.Dataset:
         """Return the touches of a machine that drifts by 10 to 30 um while the stand warms up by 2 K."""
         time = np.arange(0.0, settings.duration + 1e-9, settings.interval)
         warm = 1 - np.exp(-time / 1800.0)
@@ -138,5 +138,5 @@ class ReferenceTouches(ModelMethod):
     def conformance(cls) -> tuple[MethodSubject, ...]:
         """Return the subject of the kit, whose axes are those of the machine."""
         still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        simulated = partial(cls().simulate, Settings())
+        simulated = partial(cls().simulate, ReferenceTouchesSettings())
         return (MethodSubject(cls, simulated, raw_vectors={}, measured=("touch",), motion=still),)

@@ -11,7 +11,7 @@ from errormotion import plugins
 from errormotion.cli.summary import as_printed, figure_table, notes_of
 from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.beam_direction import BeamDirection, Settings
+from errormotion.methods.beam_direction import BeamDirection, BeamDirectionSettings
 from errormotion.plugins import FigureOfMerit
 
 
@@ -70,6 +70,6 @@ def test_values_have_the_digits_of_their_uncertainty() -> None:
 
 
 def test_a_plan_has_notes_and_no_figures() -> None:
-    planned = BeamDirection().plan(Settings())
+    planned = BeamDirection().plan(BeamDirectionSettings())
     assert figures_of(planned) == []
     assert notes_of(planned) == list(planned.attrs["notes"])

@@ -4,15 +4,14 @@ import pytest
 
 from errormotion.compensation.effect import effect
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
-from errormotion.methods.spindle_drift import Settings as DriftSettings
-from errormotion.methods.spindle_drift import SpindleDrift
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings
 from errormotion.methods.spindle_drift.simulation import simulate
 
 
 def test_figures_of_iso_230_2_are_compared() -> None:
-    settings = Settings(axis="Y", freedoms=("EY",), trials=200)
+    settings = LinearPositioningSettings(axis="Y", freedoms=("EY",), trials=200)
     raw, _ = raw_and_truth(settings, 3, Behaviour())
     raw = raw.drop_vars(
         [name for name in raw.variables if "temperature" in name or "expansion" in name]
@@ -31,8 +30,8 @@ def test_figures_of_iso_230_2_are_compared() -> None:
 
 
 def test_ranges_of_iso_230_3_stand_side_by_side() -> None:
-    settings = DriftSettings(compensate_frame=False)
-    raw, _ = simulate(DriftSettings(duration=6000.0), 3)
+    settings = SpindleDriftSettings(compensate_frame=False)
+    raw, _ = simulate(SpindleDriftSettings(duration=6000.0), 3)
     first = raw["distance"].isel(time=0)
     less = raw.assign(distance=(first + 0.2 * (raw["distance"] - first)).transpose(*raw["distance"].dims))
     less["distance"].attrs = raw["distance"].attrs

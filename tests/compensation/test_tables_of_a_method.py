@@ -4,14 +4,14 @@ import numpy as np
 import table_readers
 
 from errormotion.compensation.tables import axis_table, export, get
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
 REVERSAL = 8e-6
 
 
 def test_both_directions_of_an_axis_that_was_measured_are_corrected() -> None:
-    settings = Settings(axis="Y", freedoms=("EY",), trials=200)
+    settings = LinearPositioningSettings(axis="Y", freedoms=("EY",), trials=200)
     within = []
     for seed in range(5):
         raw, truth = raw_and_truth(settings, seed, Behaviour(reversal=REVERSAL))

@@ -14,11 +14,11 @@ from errormotion.datasets.raw import variant_of
 from errormotion.datasets.schemas import raw_schemas
 from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning import LinearPositioning
-from errormotion.methods.linear_positioning.settings import Diagonals, Settings
+from errormotion.methods.linear_positioning.settings import Diagonals, LinearPositioningSettings
 from errormotion.methods.r_test import RTest
 
-AXIS = Settings(freedoms=("EX",), runs=5, count=11, trials=200)
-DIAGONALS = Settings(diagonals=Diagonals(names=("PP0", "NP0", "PPP")), runs=5, count=7, trials=200)
+AXIS = LinearPositioningSettings(freedoms=("EX",), runs=5, count=11, trials=200)
+DIAGONALS = LinearPositioningSettings(diagonals=Diagonals(names=("PP0", "NP0", "PPP")), runs=5, count=7, trials=200)
 CASES = [
     (LinearPositioning(), AXIS, "deviation"),
     (LinearPositioning(), DIAGONALS, "diagonal_deviation"),
@@ -31,7 +31,7 @@ def changed(raw: xr.Dataset, name: str, change: Callable[[np.ndarray], np.ndarra
     return raw.assign({name: (old.dims, change(old.values.copy()), {})})
 
 
-def doubts_of(method: RTest | LinearPositioning, settings: Settings, raw: xr.Dataset) -> list[str]:
+def doubts_of(method: RTest | LinearPositioning, settings: LinearPositioningSettings, raw: xr.Dataset) -> list[str]:
     """Return the doubts, or the refusal, which is none of a unit where readings contradict one another."""
     try:
         return list(method.identify(raw, settings).em.doubts)
@@ -64,7 +64,7 @@ def test_an_instrument_that_hangs_is_doubted_or_refused(method, settings, name) 
 
 
 def test_angles_name_their_unit_as_well() -> None:
-    settings = Settings(freedoms=("EA",), runs=5, count=11, trials=200)
+    settings = LinearPositioningSettings(freedoms=("EA",), runs=5, count=11, trials=200)
     raw, _ = LinearPositioning().simulate(settings, 2)
     doubts = LinearPositioning().identify(changed(raw, "deviation", lambda y: 1e3 * y), settings).em.doubts
     assert any(note.startswith("The largest error, EA") and "in mrad" in note for note in doubts)

@@ -50,9 +50,9 @@ def measured(installed):
     """Write simulated raw data, their truth, and the same readings as a table."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(installed.site)
-        from reference_touches import ReferenceTouches, Settings
+        from reference_touches import ReferenceTouches, ReferenceTouchesSettings
 
-        raw, truth = ReferenceTouches().simulate(Settings(), 3)
+        raw, truth = ReferenceTouches().simulate(ReferenceTouchesSettings(), 3)
         del sys.modules["reference_touches"]
     datasets.save(raw, installed.work / "raw.nc")
     datasets.save(truth, installed.work / "truth.nc")

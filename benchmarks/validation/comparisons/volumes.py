@@ -7,7 +7,7 @@ import numpy as np
 from errormotion.compare import compare
 from errormotion.compare.comparable import comparable_errors
 from errormotion.datasets import DOF
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.twin import VirtualMachine
 from validation.comparisons.pool import Pool
 from validation.comparisons.rates import HEAD, against, row
@@ -27,7 +27,9 @@ def tracked(machine: VirtualMachine, q: np.ndarray, seed: int, station: np.ndarr
     """Return the errors of targets by one tracker."""
     scale = SCALE * np.random.default_rng([seed, 1]).normal()
     raw = simulation.raw(machine, q, station, seed=seed, scale=scale)
-    return Multilateration().identify(raw, Settings(noise="stated", scale_uncertainty=SCALE, parametric=False))
+    return Multilateration().identify(
+        raw, MultilaterationSettings(noise="stated", scale_uncertainty=SCALE, parametric=False)
+    )
 
 
 def trackers(seed: int) -> dict:

@@ -6,6 +6,6 @@ of two possible directions, ``sensor`` is the calibration, and ``beam`` states f
 """
 
 from errormotion.methods.beam_direction.method import BeamDirection
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
-__all__ = ["BeamDirection", "Settings"]
+__all__ = ["BeamDirection", "BeamDirectionSettings"]

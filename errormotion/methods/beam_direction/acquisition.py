@@ -25,7 +25,7 @@ from errormotion.plugins.virtual import is_virtual
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
     from errormotion.plugins import Bench
 
 
@@ -37,7 +37,7 @@ _CENTRED, _SIGN_MOVE, _SEARCH_STEP = 0.05, 0.1, 0.5
 
 def measure_planes(
     bench: Bench,
-    settings: Settings,
+    settings: BeamDirectionSettings,
     inputs: Mapping[str, xr.Dataset],  # noqa: ARG001 - the same for every method
     done: xr.Dataset | None,
 ) -> Iterator[xr.Dataset]:
@@ -48,7 +48,7 @@ def measure_planes(
     bench : Bench
         With a ``point_lds`` and a ``controller`` that moves the stage (``move_to``, ``state``). The operator is
         requested to set the gauge; a virtual machine sets it.
-    settings : Settings
+    settings : BeamDirectionSettings
     inputs : mapping
         Not used.
     done : Dataset, optional
@@ -89,7 +89,7 @@ class Setup:
         Time of a virtual machine at the start, s; None for a real one.
     """
 
-    def __init__(self, bench: Bench, settings: Settings) -> None:
+    def __init__(self, bench: Bench, settings: BeamDirectionSettings) -> None:
         self.bench, self.settings, self.layout = bench, settings, settings.layout
         self.sensor = bench.of_kind("point_lds")
         self.control: Any = control_of(bench)

@@ -9,7 +9,7 @@ import numpy as np
 
 from errormotion.methods.beam_direction.layout import Face
 from errormotion.methods.beam_direction.method import BeamDirection
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.methods.beam_direction.simulation import simulate
 from errormotion.plugins import MethodSubject
 
@@ -21,7 +21,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     ]
     subject = MethodSubject(
         BeamDirection,
-        partial(simulate, Settings(planes=tuple(planes))),
+        partial(simulate, BeamDirectionSettings(planes=tuple(planes))),
         settings={
             "layout": {
                 "nominal_direction": (np.sin(np.radians(20)), 0.0, -np.cos(np.radians(20))),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from errormotion.errors import DatasetError
 from errormotion.measurement.method import ModelMethod
 from errormotion.methods.beam_direction.schema import SCHEMA
-from errormotion.methods.beam_direction.settings import Settings as BeamSettings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class BeamDirection(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = BeamSettings
+    Settings: ClassVar[type[PluginSettings]] = BeamDirectionSettings
     raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.beam_direction.report:chapters")
     texts = lazy("errormotion.methods.beam_direction.report:texts")
@@ -46,7 +46,7 @@ class BeamDirection(ModelMethod):
     def acquire(
         self,
         bench: Bench,
-        settings: BeamSettings,
+        settings: BeamDirectionSettings,
         *,
         inputs: Mapping[str, xr.Dataset],
         done: xr.Dataset | None = None,
@@ -56,7 +56,7 @@ class BeamDirection(ModelMethod):
 
         return acquisition.measure_planes(bench, settings, inputs, done)
 
-    def check(self, settings: BeamSettings) -> dict[str, str]:
+    def check(self, settings: BeamDirectionSettings) -> dict[str, str]:
         """Return by setting why the compensation of the settings is not possible; empty if it is."""
         if settings.compensation is None:
             return {}
@@ -76,7 +76,7 @@ class BeamDirection(ModelMethod):
 
     def check_bench(
         self,
-        settings: BeamSettings,  # noqa: ARG002 - part of the protocol
+        settings: BeamDirectionSettings,  # noqa: ARG002 - part of the protocol
         bench: Bench,
         inputs: Collection[str],  # noqa: ARG002 - part of the protocol
     ) -> list[str]:
@@ -86,18 +86,18 @@ class BeamDirection(ModelMethod):
         control_of(bench)
         return unarmed(bench, "controller")
 
-    def progress(self, settings: BeamSettings) -> float:
+    def progress(self, settings: BeamDirectionSettings) -> float:
         """Return the number of planes."""
         return float(len(settings.planes))
 
-    def observe(self, raw: xr.Dataset, settings: BeamSettings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: BeamDirectionSettings) -> Observed:
         """Return readings on planes as a model of the beam."""
         from errormotion.methods.beam_direction.identification.beam import observe
         from errormotion.methods.beam_direction.identification.sensor import Sensor
 
         return observe(raw, settings, Sensor.of(raw, settings))
 
-    def identify(self, raw: xr.Dataset, settings: BeamSettings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: BeamDirectionSettings | None = None) -> xr.Dataset:
         """Return the error dataset of component ``beam``.
 
         A check bar without planes is evaluated with the beam stated in the data; the errors of the beam are then NaN.
@@ -106,7 +106,7 @@ class BeamDirection(ModelMethod):
         ----------
         raw : Dataset
             Schema ``errormotion.raw.beam_direction/1``; not modified.
-        settings : Settings, optional
+        settings : BeamDirectionSettings, optional
 
         Raises
         ------
@@ -118,15 +118,15 @@ class BeamDirection(ModelMethod):
         from errormotion.datasets.validation import checked_raw
         from errormotion.methods.beam_direction.identification.result import identify
 
-        return identify(self, checked_raw(raw, self), settings or BeamSettings())
+        return identify(self, checked_raw(raw, self), settings or BeamDirectionSettings())
 
-    def plan(self, settings: BeamSettings | None = None) -> xr.Dataset:
+    def plan(self, settings: BeamDirectionSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance, and that of the best set-ups."""
         from errormotion.methods.beam_direction.planning.plan import plan
 
-        return plan(self, settings or BeamSettings())
+        return plan(self, settings or BeamDirectionSettings())
 
-    def expected(self, settings: BeamSettings) -> xr.Dataset:
+    def expected(self, settings: BeamDirectionSettings) -> xr.Dataset:
         """Return the readings of a nominal beam on the planes of the settings."""
         from errormotion.methods.beam_direction.planning.plan import expected
 

@@ -18,13 +18,13 @@ from errormotion.methods.beam_direction.planning import design
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 SEARCH_MARGIN = 0.6
 """Distance of a face beyond the search, as a share of the range: half of the range, and the move for the sign."""
 
 
-def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+def steps(settings: BeamDirectionSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
     """Return the steps of the stage, rapid moves; positions that depend on readings are replaced by their limits.
 
     Raises
@@ -50,7 +50,7 @@ def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> l
     return result
 
 
-def search_start(settings: Settings, middle: float) -> Array:
+def search_start(settings: BeamDirectionSettings, middle: float) -> Array:
     """Return the start position of the search for a face, m; ``middle`` (m) is the reading at mid-range.
 
     Raises
@@ -72,7 +72,7 @@ def search_start(settings: Settings, middle: float) -> Array:
     return np.asarray(sign * (np.array(p.pivot) - np.array(p.nominal_origin) - middle * u / np.linalg.norm(u)))
 
 
-def stage_path(settings: Settings, normal: Array, length: float) -> Array:
+def stage_path(settings: BeamDirectionSettings, normal: Array, length: float) -> Array:
     """Return the stage positions (n, 3) on a face about its middle, m; ``length`` (m) is that of the sensor's range."""
     p = settings.layout
     if p.path:

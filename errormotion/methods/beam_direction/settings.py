@@ -17,7 +17,7 @@ def _three_planes() -> tuple[Face, ...]:
     return tuple(Face(inclination=a, rotation=float(np.radians(b))) for b in (0.0, 90.0, 180.0))
 
 
-class Settings(PluginSettings):
+class BeamDirectionSettings(PluginSettings):
     """Settings of ``beam_direction``."""
 
     beam: str = Field(default="beam", min_length=1, description="name of the beam in the result")

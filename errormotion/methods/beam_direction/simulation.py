@@ -18,7 +18,7 @@ from errormotion.arrays import Array
 from errormotion.errors import BenchError
 from errormotion.kinematics.beams import beam_errors, tilt_vector
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA, SCHEMA
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.twin import VirtualMachine, kernels, truth
 from errormotion.twin.artefacts.planes import CheckBar, Target
 from errormotion.twin.sensors.point_sensor import RECEIVER, PointSensor
@@ -41,7 +41,7 @@ _BAR_STREAM = 3
 _M, _1, _RAD = {"units": "m"}, {"units": "1"}, {"units": "rad"}
 
 
-def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def simulate(settings: BeamDirectionSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return readings with speckle on the planes of the settings, and the true errors of the beam.
 
     The readings have no inclination error. The seed selects the machine and the noise.

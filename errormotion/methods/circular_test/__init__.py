@@ -5,6 +5,6 @@ the effect of the errors of two axes on a circle, and ``figures`` computes the f
 """
 
 from errormotion.methods.circular_test.method import CircularTest
-from errormotion.methods.circular_test.settings import Settings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 
-__all__ = ["CircularTest", "Settings"]
+__all__ = ["CircularTest", "CircularTestSettings"]

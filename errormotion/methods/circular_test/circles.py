@@ -26,7 +26,7 @@ from errormotion.estimation.robust import scale_about_zero
 from errormotion.measurement import Block, Constant, Noise, Places, Problem
 from errormotion.methods.circular_test.path import DIRECTIONS, SENSE, TAU, basis, circle, over_sectors
 from errormotion.methods.circular_test.schema import READINGS
-from errormotion.methods.circular_test.settings import Settings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 
 T = TypeVar("T")
 DRIFT = "drift of the bar"
@@ -113,7 +113,7 @@ class Circles:
         return at_readings, found / scale
 
 
-def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Circles:
+def read(raw: xr.Dataset, settings: CircularTestSettings, notes: list[str]) -> Circles:
     """Return the readings of a raw dataset that conforms to its schema.
 
     Raises
@@ -239,7 +239,9 @@ class Sectors:
         return np.asarray(self.noise**2 * np.einsum("iabc,jabc->ij", a, forward + backward[..., ::-1] - a))
 
 
-def problem_of(circles: Circles, settings: Settings, places: int, decay: float, notes: list[str]) -> Sectors:
+def problem_of(
+    circles: Circles, settings: CircularTestSettings, places: int, decay: float, notes: list[str]
+) -> Sectors:
     """Return the means over sectors as a problem: a reading sees one sector; drift and constants are common.
 
     Raises
@@ -327,7 +329,7 @@ def _noise(
     index: NDArray[np.intp],
     count: NDArray[np.intp],
     degrees: int,
-    settings: Settings,
+    settings: CircularTestSettings,
     notes: list[str],
     shared: Array,
 ) -> float:
@@ -391,7 +393,7 @@ def _shared(sector: NDArray[np.intp], known: NDArray[np.bool_], phi: float, size
     return np.asarray(2 * pairs / np.maximum(count * (count - 1), 1))
 
 
-def _check_gaps(count: NDArray[np.intp], places: int, settings: Settings) -> None:
+def _check_gaps(count: NDArray[np.intp], places: int, settings: CircularTestSettings) -> None:
     """Refuse arcs: only full circles determine the centre (ISO 230-4)."""
     for name, row in zip(DIRECTIONS, count, strict=True):
         empty = np.flatnonzero(np.tile(row == 0, 2))

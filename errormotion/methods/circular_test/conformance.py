@@ -6,13 +6,13 @@ from functools import partial
 
 from errormotion.methods.circular_test.method import CircularTest
 from errormotion.methods.circular_test.schema import OPTIONAL
-from errormotion.methods.circular_test.settings import Settings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 from errormotion.plugins import MethodSubject
 
 
 def subjects() -> tuple[MethodSubject, ...]:
     """Return the subject."""
-    settings = Settings(samples=540, places=60)
+    settings = CircularTestSettings(samples=540, places=60)
     return (
         MethodSubject(
             CircularTest,

@@ -36,7 +36,7 @@ from errormotion.estimation.fit import fit
 from errormotion.estimation.sources import errors_of
 from errormotion.methods.circular_test.circles import DRIFT, Circles, places_of, problem_of
 from errormotion.methods.circular_test.path import TAU, circle, middles
-from errormotion.methods.circular_test.settings import Settings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 
 MEANINGS = {
     "G(CCW)": "circular deviation, counterclockwise",
@@ -68,7 +68,7 @@ class Figures:
     influence: dict[str, Array]
 
 
-def of_circles(circles: Circles, settings: Settings, phi: float = 0.0) -> Figures:
+def of_circles(circles: Circles, settings: CircularTestSettings, phi: float = 0.0) -> Figures:
     """Return the figures of the finest path that the readings determine, with a noise of this correlation.
 
     The mean over a sector reduces a spike at a reversal, on the unsafe side. The path has therefore as many sectors as
@@ -86,7 +86,7 @@ def of_circles(circles: Circles, settings: Settings, phi: float = 0.0) -> Figure
     return replace(fine, covariance=fine.covariance + np.diag((fine.value - coarse.value) ** 2))
 
 
-def _of_sectors(circles: Circles, settings: Settings, places: int, decay: float, phi: float) -> Figures:
+def _of_sectors(circles: Circles, settings: CircularTestSettings, places: int, decay: float, phi: float) -> Figures:
     """Return the figures of means over a number of sectors plus the model of the path within them."""
     sectors = problem_of(circles, settings, places, decay, [])
     problem = sectors.problem

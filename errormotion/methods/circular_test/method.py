@@ -15,7 +15,7 @@ import xarray as xr
 
 from errormotion.measurement import Datum, ModelMethod, Observed
 from errormotion.methods.circular_test.schema import READINGS, SCHEMA
-from errormotion.methods.circular_test.settings import Settings as TestSettings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 from errormotion.plugins import FigureOfMerit, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class CircularTest(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=(), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = TestSettings
+    Settings: ClassVar[type[PluginSettings]] = CircularTestSettings
     raw_schemas = lazy("errormotion.methods.circular_test.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.circular_test.conformance:subjects")
     chapters = lazy("errormotion.methods.circular_test.report:chapters")
@@ -59,7 +59,7 @@ class CircularTest(ModelMethod):
         from errormotion.methods.circular_test.circles import DRIFT, places_of, problem_of, read
         from errormotion.methods.circular_test.path import DIRECTIONS, middles
 
-        settings, notes = settings or TestSettings(), list[str]()
+        settings, notes = settings or CircularTestSettings(), list[str]()
         circles = read(raw, settings, notes)
         sectors = problem_of(circles, settings, settings.places, settings.spike_decay, notes)
         known = sectors.count.ravel() > 0

@@ -34,7 +34,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.methods.circular_test.schema import READINGS, SCHEMA
-from errormotion.methods.circular_test.settings import Settings
+from errormotion.methods.circular_test.settings import CircularTestSettings
 
 TAU = 2 * np.pi
 DIRECTIONS = ("CCW", "CW")
@@ -108,7 +108,7 @@ def over_sectors(places: int, radius: float, feed: float, decay: float) -> Array
     return found
 
 
-def position(errors: Mapping[str, float], angle: Array, sense: Array, settings: Settings) -> Array:
+def position(errors: Mapping[str, float], angle: Array, sense: Array, settings: CircularTestSettings) -> Array:
     """Return the position of the tool in the plane, exactly, (..., 2), m.
 
     ``errors`` are any of `PARAMETERS`, ``scale`` of both axes, and ``lobes``, five of which no parameter describes, m.
@@ -134,7 +134,7 @@ def position(errors: Mapping[str, float], angle: Array, sense: Array, settings: 
     return np.stack([r * cos + first, r * sin + second], axis=-1)
 
 
-def expected(settings: Settings, errors: Mapping[str, float] = TYPICAL) -> xr.Dataset:
+def expected(settings: CircularTestSettings, errors: Mapping[str, float] = TYPICAL) -> xr.Dataset:
     """Return the readings of a test without noise: circles alternately counterclockwise and clockwise."""
     R, V, n, runs = settings.nominal_radius, settings.feed, settings.samples, settings.runs
     phase = np.mod((np.arange(2 * runs) + 0.5) * (np.sqrt(5) - 1) / 2, 1.0).reshape(2, runs, 1)

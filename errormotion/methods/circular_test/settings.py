@@ -13,7 +13,7 @@ from errormotion.plugins import PluginSettings
 DEGREE = math.pi / 180
 
 
-class Settings(PluginSettings):
+class CircularTestSettings(PluginSettings):
     """The test to plan or to simulate, the evaluation, and the limits of the figures."""
 
     # The test

@@ -6,7 +6,7 @@ from functools import partial
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.crossbeam_scan.method import CrossbeamScan
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.methods.crossbeam_scan.simulation import POSITIONS, simulate
 from errormotion.plugins import MethodSubject
 
@@ -28,7 +28,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     return (
         MethodSubject(
             CrossbeamScan,
-            partial(simulate, Settings.model_validate(scan | small)),
+            partial(simulate, CrossbeamScanSettings.model_validate(scan | small)),
             name="scan",
             settings={"positions": POSITIONS},
             raw_vectors={"profiler_pose": "pose", "lever": "direction"},
@@ -39,7 +39,7 @@ def subjects() -> tuple[MethodSubject, ...]:
         ),
         MethodSubject(
             CrossbeamScan,
-            partial(simulate, Settings.model_validate(pose | coarse)),
+            partial(simulate, CrossbeamScanSettings.model_validate(pose | coarse)),
             name="profiler_pose",
             settings=pose,
             raw_vectors={},
@@ -50,7 +50,7 @@ def subjects() -> tuple[MethodSubject, ...]:
         ),
         MethodSubject(
             CrossbeamScan,
-            partial(ModelMethod.simulate, CrossbeamScan(), Settings.model_validate(registered)),
+            partial(ModelMethod.simulate, CrossbeamScan(), CrossbeamScanSettings.model_validate(registered)),
             name="registrations",
             settings=registered,
             raw_vectors={"profiler_pose": "pose", "lever": "direction"},

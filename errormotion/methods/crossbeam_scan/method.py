@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
-from errormotion.methods.crossbeam_scan.settings import Settings as ScanSettings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class CrossbeamScan(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = ScanSettings
+    Settings: ClassVar[type[PluginSettings]] = CrossbeamScanSettings
     raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
     texts = lazy("errormotion.methods.crossbeam_scan.report:texts")
@@ -45,7 +45,12 @@ class CrossbeamScan(ModelMethod):
     conformance = lazy("errormotion.methods.crossbeam_scan.conformance:subjects")
 
     def acquire(
-        self, bench: Bench, settings: ScanSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
+        self,
+        bench: Bench,
+        settings: CrossbeamScanSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``. See ``acquisition`` and ``pocket``."""
         from errormotion.methods.crossbeam_scan.acquisition import pocket
@@ -59,7 +64,7 @@ class CrossbeamScan(ModelMethod):
         """Return the travel of Y."""
         return {"travel": machine.travel["Y"]} if "Y" in machine.travel else {}
 
-    def check_machine(self, settings: ScanSettings, machine: MachineDescription) -> dict[str, str]:
+    def check_machine(self, settings: CrossbeamScanSettings, machine: MachineDescription) -> dict[str, str]:
         """Return what contradicts the machine: Y does not carry the tool, or passes outside of its travel."""
         if "Y" not in machine.tool_axes:
             return {"": f"expected a machine whose axis Y carries the tool; found the chain '{machine.chain}'"}
@@ -80,7 +85,7 @@ class CrossbeamScan(ModelMethod):
 
     def check_bench(
         self,
-        settings: ScanSettings,
+        settings: CrossbeamScanSettings,
         bench: Bench,
         inputs: Collection[str],
     ) -> list[str]:
@@ -97,17 +102,17 @@ class CrossbeamScan(ModelMethod):
         moves = not hasattr(profiler, "scans") and isinstance(mover(bench), Controlled)
         return unarmed(bench, "controller") if moves else []
 
-    def append_dim(self, settings: ScanSettings) -> str:
+    def append_dim(self, settings: CrossbeamScanSettings) -> str:
         """Return ``scan`` for the profiler's pose, ``line`` for scans."""
         return "scan" if settings.procedure == "profiler_pose" else "line"
 
-    def progress(self, settings: ScanSettings) -> float:
+    def progress(self, settings: CrossbeamScanSettings) -> float:
         """Return the expected number of lines, or of scans of the pocket."""
         from errormotion.methods.crossbeam_scan.acquisition.scans import expected_lines
 
         return float(len(settings.pocket_lifts) if settings.procedure == "profiler_pose" else expected_lines(settings))
 
-    def follow(self, settings: ScanSettings) -> Callable[[xr.Dataset], str]:
+    def follow(self, settings: CrossbeamScanSettings) -> Callable[[xr.Dataset], str]:
         """Return a function that reports the progress for each chunk."""
         from errormotion.methods.crossbeam_scan.acquisition.live import LiveScans
 
@@ -115,7 +120,7 @@ class CrossbeamScan(ModelMethod):
 
     def programs(
         self,
-        settings: ScanSettings,
+        settings: CrossbeamScanSettings,
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> Mapping[str, str]:
         """Return the NC programs of a campaign, name to text."""
@@ -125,7 +130,7 @@ class CrossbeamScan(ModelMethod):
 
     def motions(
         self,
-        settings: ScanSettings,
+        settings: CrossbeamScanSettings,
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> list[Step]:
         """Return every step of the machine, for the check of its limits and for a dry run."""
@@ -133,13 +138,13 @@ class CrossbeamScan(ModelMethod):
 
         return steps(settings)
 
-    def observe(self, raw: xr.Dataset, settings: ScanSettings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: CrossbeamScanSettings) -> Observed:
         """Return the registrations of scans as a problem of least squares; see ``identification.model``."""
         from errormotion.methods.crossbeam_scan.identification.scans import observe
 
         return observe(raw, settings)[0]
 
-    def expected(self, settings: ScanSettings) -> xr.Dataset:
+    def expected(self, settings: CrossbeamScanSettings) -> xr.Dataset:
         """Return the registrations of a campaign, without noise; see ``planning``."""
         from errormotion.methods.crossbeam_scan.planning import expected
 
@@ -147,27 +152,27 @@ class CrossbeamScan(ModelMethod):
             raise NotImplementedError("edges of a pocket scatter as the sensor sees them: nothing is expected of scans")
         return expected(settings)
 
-    def plan(self, settings: ScanSettings | None = None) -> xr.Dataset:
+    def plan(self, settings: CrossbeamScanSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance. See ``planning``."""
         from errormotion.methods.crossbeam_scan.planning import plan_pose
 
-        settings = settings or ScanSettings()
+        settings = settings or CrossbeamScanSettings()
         return plan_pose(self.info, settings) if settings.procedure == "profiler_pose" else super().plan(settings)
 
-    def redrawing(self, raw: xr.Dataset, settings: ScanSettings, errors: xr.Dataset) -> Redrawing:
+    def redrawing(self, raw: xr.Dataset, settings: CrossbeamScanSettings, errors: xr.Dataset) -> Redrawing:
         """Return the sources of scans, or those of a pocket, for the Monte Carlo evaluation."""
         from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import redrawing
 
         return redrawing(raw, settings) if "pocket_radius" in raw else super().redrawing(raw, settings, errors)
 
-    def identify(self, raw: xr.Dataset, settings: ScanSettings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: CrossbeamScanSettings | None = None) -> xr.Dataset:
         """Return the error dataset of a raw dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.
 
         Parameters
         ----------
         raw : Dataset
             Schema ``errormotion.raw.crossbeam_scan/1``, any variant; not modified; it may be larger than memory.
-        settings : Settings, optional
+        settings : CrossbeamScanSettings, optional
 
         Raises
         ------
@@ -178,7 +183,7 @@ class CrossbeamScan(ModelMethod):
         """
         from errormotion.datasets.validation import checked_raw
 
-        settings = settings or ScanSettings()
+        settings = settings or CrossbeamScanSettings()
         checked = checked_raw(raw, self)
         if "pocket_radius" in checked:
             from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import identify_pose

@@ -25,7 +25,7 @@ from errormotion.methods.crossbeam_scan.schema import SCHEMA
 from errormotion.methods.crossbeam_scan.settings import PoseSettings
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
     from errormotion.plugins import MethodInfo
 
 
@@ -37,7 +37,7 @@ _CELLS = 100  # of a profile
 _SINGULAR = 1e12  # condition number
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: CrossbeamScanSettings) -> xr.Dataset:
     """Return the registrations of scans without noise, for a carriage on its guide with errors of typical size.
 
     Raises
@@ -86,7 +86,7 @@ def expected(settings: Settings) -> xr.Dataset:
     )
 
 
-def registration_covariance(settings: Settings) -> tuple[Array, Array]:
+def registration_covariance(settings: CrossbeamScanSettings) -> tuple[Array, Array]:
     """Return the expected covariance (9, 9) of (T_Q, R_Q, drift) by noise, and their errors (9, 3) by the strains.
 
     A rigid scan has no drift. What strains are is stated with `Registrations`.
@@ -126,7 +126,7 @@ def registration_covariance(settings: Settings) -> tuple[Array, Array]:
     return out, effect
 
 
-def plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
+def plan_pose(info: MethodInfo, settings: CrossbeamScanSettings) -> xr.Dataset:
     """Return the plan of scans of a pocket: edges of the rim, and the plate next to it.
 
     Raises
@@ -173,7 +173,7 @@ def plan_pose(info: MethodInfo, settings: Settings) -> xr.Dataset:
     )
 
 
-def _pocket(settings: Settings, parameters: Array) -> Array:
+def _pocket(settings: CrossbeamScanSettings, parameters: Array) -> Array:
     """Return the observations of the fit of a pocket with (a, b, g, dx, dy, dz, r), in units of its noise."""
     layout, radius = settings.layout, settings.pocket_radius
     nominal = stated_pose(settings.profiler_pose or PoseSettings())

@@ -43,7 +43,7 @@ class Layout(PluginSettings):
     jitter_y: Length = Field(default=2e-6, ge=0, description="standard deviation of a line's position along the feed")
 
 
-class Settings(PluginSettings):
+class CrossbeamScanSettings(PluginSettings):
     """Settings of ``crossbeam_scan``."""
 
     procedure: Literal["scan", "profiler_pose"] = Field(
@@ -169,7 +169,7 @@ class Settings(PluginSettings):
         return HEIGHT if self.artefact_height is None else self.artefact_height
 
     @model_validator(mode="after")
-    def _fits(self) -> Settings:
+    def _fits(self) -> CrossbeamScanSettings:
         for name, unit in (("positions", 1e-3), ("warm_up", MINUTE)):
             values = getattr(self, name)
             if any(not first < second for first, second in pairwise(values)):

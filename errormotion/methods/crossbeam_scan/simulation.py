@@ -26,7 +26,7 @@ from errormotion.twin.artefacts.pieces import Artefact, circular_pocket, swept
 from errormotion.twin.sensors.profiler import Profiler
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 POSITIONS = (-0.5, 0.0, 0.5)
 """Positions of the axis over the artefacts where the settings state none, m."""
@@ -34,7 +34,7 @@ _SCAN, _PHASE = 1, 2
 _LEVER, _STRAIN = 2, 3
 
 
-def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def simulate(settings: CrossbeamScanSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return the raw dataset of a campaign or of a pocket with these settings, and the true errors.
 
     The size of a scan follows from ``scan_length``, ``line_pitch`` and ``layout``. There is one cold pass. The stated
@@ -64,7 +64,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     return raw, truth_axis(machine, times, positions)
 
 
-def strained(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> xr.Dataset:
+def strained(raw: xr.Dataset, settings: CrossbeamScanSettings, generator: np.random.Generator) -> xr.Dataset:
     """Return scans with scales of the profiler, and expansions of its mount and of artefacts, as settings state them.
 
     Scales and mount are one draw for each warm cycle, the expansion one for each scan. An artefact expands about the

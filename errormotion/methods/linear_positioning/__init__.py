@@ -8,6 +8,6 @@ the bias and uncertainty of figures that are extreme values, and ``identify`` st
 """
 
 from errormotion.methods.linear_positioning.method import LinearPositioning
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
-__all__ = ["LinearPositioning", "Settings"]
+__all__ = ["LinearPositioning", "LinearPositioningSettings"]

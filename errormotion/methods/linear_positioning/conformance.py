@@ -6,7 +6,13 @@ from functools import partial
 from typing import Literal
 
 from errormotion.methods.linear_positioning.method import LinearPositioning
-from errormotion.methods.linear_positioning.settings import FREEDOMS, Diagonals, Freedom, Moving, Settings
+from errormotion.methods.linear_positioning.settings import (
+    FREEDOMS,
+    Diagonals,
+    Freedom,
+    LinearPositioningSettings,
+    Moving,
+)
 from errormotion.plugins import MethodSubject
 
 OPTIONAL = (
@@ -20,7 +26,9 @@ MOTION = ((0.0, 0.0, 0.0), (0.1, -0.2, 0.05))
 
 def subjects() -> tuple[MethodSubject, ...]:
     """Return the tests on a short axis and along short diagonals."""
-    moving = Settings(freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
+    moving = LinearPositioningSettings(
+        freedoms=("EX", "EB"), moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0)
+    )
     warming = MethodSubject(
         LinearPositioning,
         partial(LinearPositioning().simulate, moving),
@@ -39,7 +47,10 @@ def _diagonals() -> MethodSubject:
     names = ("PP0", "NP0", "PPP", "NNP")
     return MethodSubject(
         LinearPositioning,
-        partial(LinearPositioning().simulate, Settings(diagonals=Diagonals(names=names), runs=RUNS, count=7)),
+        partial(
+            LinearPositioning().simulate,
+            LinearPositioningSettings(diagonals=Diagonals(names=names), runs=RUNS, count=7),
+        ),
         raw_vectors={"stop_point": "point", "functional_point": "point"},
         settings={"diagonals": {"names": names}, "trials": 200},
         name="diagonals",
@@ -54,7 +65,9 @@ def _subject(name: str, axis: Literal["X", "Y"], freedoms: tuple[Freedom, ...]) 
     coordinate: Literal["x", "y"] = "x" if axis == "X" else "y"
     return MethodSubject(
         LinearPositioning,
-        partial(LinearPositioning().simulate, Settings(freedoms=freedoms, axis=axis, runs=RUNS, count=7)),
+        partial(
+            LinearPositioning().simulate, LinearPositioningSettings(freedoms=freedoms, axis=axis, runs=RUNS, count=7)
+        ),
         raw_vectors={"target_position": coordinate, "zero_position": coordinate, "functional_point": "point"},
         settings={"freedoms": freedoms, "axis": axis, "trials": 200},
         name=name,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.linear_positioning.schema import SCHEMA
-from errormotion.methods.linear_positioning.settings import LIMITS
-from errormotion.methods.linear_positioning.settings import Settings as PositioningSettings
+from errormotion.methods.linear_positioning.settings import LIMITS, LinearPositioningSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ class LinearPositioning(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = PositioningSettings
+    Settings: ClassVar[type[PluginSettings]] = LinearPositioningSettings
     raw_schemas = lazy("errormotion.methods.linear_positioning.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
     texts = lazy("errormotion.methods.linear_positioning.report:texts")
@@ -50,7 +49,7 @@ class LinearPositioning(ModelMethod):
     def acquire(
         self,
         bench: Bench,
-        settings: PositioningSettings,
+        settings: LinearPositioningSettings,
         *,
         inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
         done: xr.Dataset | None = None,
@@ -68,7 +67,7 @@ class LinearPositioning(ModelMethod):
 
     def motions(
         self,
-        settings: PositioningSettings,
+        settings: LinearPositioningSettings,
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> list[Step]:
         """Return every step of the machine, for the check of its limits and for a dry run."""
@@ -79,7 +78,7 @@ class LinearPositioning(ModelMethod):
 
     def programs(
         self,
-        settings: PositioningSettings,
+        settings: LinearPositioningSettings,
         instruments: Mapping[str, Any] | None = None,  # noqa: ARG002 - part of the protocol
     ) -> Mapping[str, str]:
         """Return the NC program of the test by file name."""
@@ -88,7 +87,7 @@ class LinearPositioning(ModelMethod):
 
         return planning.programs(settings) if settings.diagonals is not None else programs(settings)
 
-    def check(self, settings: PositioningSettings) -> dict[str, str]:
+    def check(self, settings: LinearPositioningSettings) -> dict[str, str]:
         """Return that the runs cannot determine their scatter or drift, and the settings do not state them."""
         if settings.diagonals is not None or settings.moving is not None:
             return {}
@@ -96,7 +95,7 @@ class LinearPositioning(ModelMethod):
 
         return lacking(settings)
 
-    def check_machine(self, settings: PositioningSettings, machine: MachineDescription) -> dict[str, str]:
+    def check_machine(self, settings: LinearPositioningSettings, machine: MachineDescription) -> dict[str, str]:
         """Return by setting what the machine cannot do: an axis that it does not have, targets outside its travel."""
         from errormotion.methods.linear_positioning.diagonals import planning
         from errormotion.methods.linear_positioning.planning.targets import reach
@@ -114,7 +113,7 @@ class LinearPositioning(ModelMethod):
             }
         return {}
 
-    def cannot_continue(self, settings: PositioningSettings) -> str:
+    def cannot_continue(self, settings: LinearPositioningSettings) -> str:
         """Return why an interrupted test of a moving axis cannot be continued."""
         from errormotion.methods.linear_positioning.acquisition.warming import NOT_CONTINUED
 
@@ -122,7 +121,7 @@ class LinearPositioning(ModelMethod):
 
     def check_bench(
         self,
-        settings: PositioningSettings,
+        settings: LinearPositioningSettings,
         bench: Bench,
         inputs: Collection[str],  # noqa: ARG002 - part of the protocol
     ) -> list[str]:
@@ -137,7 +136,7 @@ class LinearPositioning(ModelMethod):
             AxisMeasurement(bench, settings)
         return unarmed(bench, "controller")
 
-    def append_dim(self, settings: PositioningSettings) -> str:
+    def append_dim(self, settings: LinearPositioningSettings) -> str:
         """Return ``run``, ``target`` for pendulum cycles, ``cycle`` for a moving axis, ``diagonal`` for diagonals."""
         if settings.diagonals is not None:
             return "diagonal"
@@ -145,7 +144,7 @@ class LinearPositioning(ModelMethod):
             return "cycle"
         return "run" if settings.cycle == "linear" else "target"
 
-    def progress(self, settings: PositioningSettings) -> float:
+    def progress(self, settings: LinearPositioningSettings) -> float:
         """Return the number of runs, of targets for pendulum cycles, of readings of a moving axis, of diagonals."""
         from errormotion.methods.linear_positioning import moving
         from errormotion.methods.linear_positioning.planning.targets import positions
@@ -156,13 +155,13 @@ class LinearPositioning(ModelMethod):
             return float(sum(1 for _ in moving.cycles(settings)))
         return float(settings.runs if settings.cycle == "linear" else positions(settings).size)
 
-    def observe(self, raw: xr.Dataset, settings: PositioningSettings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: LinearPositioningSettings) -> Observed:
         """Return what raw data mean, as stated in `identification.model`, or in `identification.moving`."""
         its = _evaluation(raw)
         observed: Observed = its.observe(raw, its.evaluate(raw, settings), settings)
         return observed
 
-    def expected(self, settings: PositioningSettings) -> xr.Dataset:
+    def expected(self, settings: LinearPositioningSettings) -> xr.Dataset:
         """Return the readings of a test without noise, of an axis of the virtual machine."""
         from errormotion.methods.linear_positioning import simulation
 
@@ -176,7 +175,7 @@ class LinearPositioning(ModelMethod):
 
         return squareness(observed, relative)
 
-    def identify(self, raw: xr.Dataset, settings: PositioningSettings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: LinearPositioningSettings | None = None) -> xr.Dataset:
         """Return the error dataset of an axis over ``position``, or of diagonals over their stops.
 
         The model states the errors; the figures of the standard are added, which no trial and no plan needs.
@@ -185,7 +184,7 @@ class LinearPositioning(ModelMethod):
         ----------
         raw : Dataset
             Schema ``errormotion.raw.linear_positioning/1``; not modified.
-        settings : Settings, optional
+        settings : LinearPositioningSettings, optional
 
         Raises
         ------
@@ -198,7 +197,7 @@ class LinearPositioning(ModelMethod):
         from errormotion.datasets.validation import checked_raw
         from errormotion.measurement.identification import dataset, solve
 
-        settings = settings or PositioningSettings()
+        settings = settings or LinearPositioningSettings()
         checked = checked_raw(raw, self)
         its = _evaluation(checked)
         evaluated = its.evaluate(checked, settings)
@@ -215,7 +214,7 @@ class LinearPositioning(ModelMethod):
             return found
         return found.assign_attrs({"straightness_reference": place} | found.attrs)
 
-    def simulate(self, settings: PositioningSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+    def simulate(self, settings: LinearPositioningSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return raw data with every source of the model drawn once, and the true errors.
 
         They do not state the scatter, which a test estimates, unless it has too few runs.
@@ -226,11 +225,11 @@ class LinearPositioning(ModelMethod):
         few = settings.moving is None and settings.runs < MIN_RUNS
         return (raw if few else raw.drop_vars(["reading_scatter", "run_drift"], errors="ignore")), true
 
-    def plan(self, settings: PositioningSettings | None = None) -> xr.Dataset:
+    def plan(self, settings: LinearPositioningSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""
         from errormotion.methods.linear_positioning.plan import summary
 
-        settings = settings or PositioningSettings()
+        settings = settings or LinearPositioningSettings()
         planned = super().plan(settings)
         return planned.assign_attrs(notes=[*planned.em.notes, summary(planned, settings)])
 

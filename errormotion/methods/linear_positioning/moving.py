@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Moving, Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings, Moving
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Cycle:
     cold: bool
 
 
-def moving_of(settings: Settings) -> Moving:
+def moving_of(settings: LinearPositioningSettings) -> Moving:
     """Return the settings of the moving axis; MethodError if there are none."""
     if settings.moving is None:
         raise MethodError(
@@ -44,14 +44,14 @@ def moving_of(settings: Settings) -> Moving:
     return settings.moving
 
 
-def ends(settings: Settings) -> tuple[float, float]:
+def ends(settings: LinearPositioningSettings) -> tuple[float, float]:
     """Return both ends of the stroke, those of the travel, m; MethodError if they are outside the limits."""
     low, high = settings.travel
     check_limits(settings, low, high)
     return low, high
 
 
-def check_limits(settings: Settings, low: float, high: float) -> None:
+def check_limits(settings: LinearPositioningSettings, low: float, high: float) -> None:
     """Raise MethodError if the axis would leave its limits between two positions, m."""
     if settings.limits is not None:
         lowest, highest = settings.limits
@@ -64,7 +64,7 @@ def check_limits(settings: Settings, low: float, high: float) -> None:
             )
 
 
-def cycles(settings: Settings) -> Iterator[Cycle]:
+def cycles(settings: LinearPositioningSettings) -> Iterator[Cycle]:
     """Yield the readings in their order: cold, while the axis moves, and while it cools."""
     moving = moving_of(settings)
     for _ in range(moving.cold):
@@ -77,19 +77,19 @@ def cycles(settings: Settings) -> Iterator[Cycle]:
         yield Cycle(0, rest, moving=False, cold=False)
 
 
-def stroke_time(settings: Settings) -> float:
+def stroke_time(settings: LinearPositioningSettings) -> float:
     """Return the duration of a stroke back and forth, s; accelerations are neglected."""
     low, high = ends(settings)
     return 2.0 * (high - low) / moving_of(settings).feed
 
 
-def reading_time(settings: Settings) -> float:
+def reading_time(settings: LinearPositioningSettings) -> float:
     """Return the duration of a reading of both ends, s."""
     low, high = ends(settings)
     return 2.0 * ((high - low) / settings.feed + settings.dwell)
 
 
-def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
+def stops(settings: LinearPositioningSettings) -> Iterator[tuple[float, float, float]]:
     """Yield every stop of the axis: position, m, feed of the move to it, m/s, and dwell, s.
 
     The axis starts at its lower end. A reading is taken at the upper end, approached forward, and then at the lower

@@ -14,10 +14,10 @@ from errormotion.methods.linear_positioning.planning.targets import seconds
 from errormotion.methods.linear_positioning.simulation import planned_scatter
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 
-def summary(planned: xr.Dataset, settings: Settings) -> str:
+def summary(planned: xr.Dataset, settings: LinearPositioningSettings) -> str:
     """Return the size of a test, its duration, and the expected standard uncertainties."""
     scatter, drift = (format_quantity(value, "um", 2) for value in planned_scatter(settings))
     if settings.diagonals is not None:

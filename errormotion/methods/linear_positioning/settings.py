@@ -128,7 +128,7 @@ class Diagonals(PluginSettings):
         return self
 
 
-class Settings(PluginSettings):
+class LinearPositioningSettings(PluginSettings):
     """Settings of ``linear_positioning``: the test, its evaluation, and its sources of uncertainty."""
 
     # The test
@@ -216,7 +216,7 @@ class Settings(PluginSettings):
     reversal_limit: Length | None = Field(default=None, gt=0, description="limit of B of positioning; default none")
 
     @model_validator(mode="after")
-    def _fits(self) -> Settings:
+    def _fits(self) -> LinearPositioningSettings:
         low, high = self.travel
         if not low < high:
             raise ValueError(f"travel: expected the lower end first; found {low:g} m and {high:g} m")

@@ -25,7 +25,7 @@ from errormotion.methods.linear_positioning.warming import expected_moving
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 SCATTER, DRIFT = 0.5e-6, 1.0e-6
 """Defaults of the standard deviation of a reading and of the range by drift during a run, m or rad."""
@@ -51,7 +51,7 @@ class Behaviour:
     reversal: float = 1.5e-6
 
 
-def planned_scatter(settings: Settings) -> tuple[float, float]:
+def planned_scatter(settings: LinearPositioningSettings) -> tuple[float, float]:
     """Return standard deviation of a reading and range by drift during a run that a plan assumes, m or rad."""
     stated = settings.uncertainty
     return (
@@ -60,7 +60,7 @@ def planned_scatter(settings: Settings) -> tuple[float, float]:
     )
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: LinearPositioningSettings) -> xr.Dataset:
     """Return readings without noise at targets, at the ends of a moving axis, or along diagonals.
 
     They state the scatter and the drift that the settings state or a plan assumes, and the expansion and temperatures
@@ -98,7 +98,9 @@ def expected(settings: Settings) -> xr.Dataset:
     return _raw(settings, P, x, temperature).assign(stated)
 
 
-def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[xr.Dataset, xr.Dataset]:
+def raw_and_truth(
+    settings: LinearPositioningSettings, seed: int, behaviour: Behaviour
+) -> tuple[xr.Dataset, xr.Dataset]:
     """Return deviations and true errors for an axis with a given behaviour.
 
     The seed selects the machine, its scatter, and the errors of the instrument.
@@ -127,14 +129,16 @@ def raw_and_truth(settings: Settings, seed: int, behaviour: Behaviour) -> tuple[
     return raw.assign_attrs(attrs), _truth(machine, settings, P, true)
 
 
-def _true(machine: VirtualMachine, settings: Settings, P: Array, reversal: float) -> Array:
+def _true(machine: VirtualMachine, settings: LinearPositioningSettings, P: Array, reversal: float) -> Array:
     """Return the mean deviations, (freedom, target), relative to the first target approached forward."""
     columns = [DOF.index(name) for name in settings.freedoms]
     geometric = machine.geometry.motions[settings.axis](np.append(P, P[0]))
     return np.asarray((geometric[:-1] - geometric[-1]).T[columns] - reversal / 2.0)
 
 
-def _raw(settings: Settings, P: Array, x: Array, temperature: Mapping[str, Array | float]) -> xr.Dataset:
+def _raw(
+    settings: LinearPositioningSettings, P: Array, x: Array, temperature: Mapping[str, Array | float]
+) -> xr.Dataset:
     """Return readings x (freedom, run, approach, target) with temperatures by sensor, degC, as a raw dataset."""
     budget, names = settings.uncertainty, iso_names(settings.axis)
     variables: dict[str, Any] = {
@@ -169,7 +173,7 @@ def _departures(behaviour: Behaviour, runs: int, P: Array, generator: np.random.
     return np.asarray(sign * behaviour.reversal / 2.0 + common + opposite + noise)
 
 
-def _truth(machine: VirtualMachine, settings: Settings, P: Array, true: Array) -> xr.Dataset:
+def _truth(machine: VirtualMachine, settings: LinearPositioningSettings, P: Array, true: Array) -> xr.Dataset:
     """Return the true errors; of a straightness relative to the line through the first and the last target."""
     twist = np.full((P.size, 6), np.nan)
     along = direction_of(settings.axis)

@@ -13,7 +13,7 @@ from errormotion.methods.linear_positioning.moving import cycles, ends, moving_o
 from errormotion.methods.linear_positioning.schema import SCHEMA
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 GROWTH, SHIFT = 30e-6, 8e-6
 """Final relative expansion of the screw, 1, and displacement of its bearing, m (rad for rotations)."""
@@ -23,7 +23,7 @@ COLD_INTERVAL = 30.0
 """Interval of the cold readings, s."""
 
 
-def expected_moving(settings: Settings, scatter: float) -> xr.Dataset:
+def expected_moving(settings: LinearPositioningSettings, scatter: float) -> xr.Dataset:
     """Return readings at both ends of the stroke without noise, with the standard deviation ``scatter``, m or rad."""
     plan = list(cycles(settings))
     cold = sum(cycle.cold for cycle in plan)

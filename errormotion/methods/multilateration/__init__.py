@@ -11,6 +11,6 @@ laser tracker.
 """
 
 from errormotion.methods.multilateration.method import Multilateration
-from errormotion.methods.multilateration.settings import Settings
+from errormotion.methods.multilateration.settings import MultilaterationSettings
 
-__all__ = ["Multilateration", "Settings"]
+__all__ = ["Multilateration", "MultilaterationSettings"]

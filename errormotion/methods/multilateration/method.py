@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.multilateration.schema import SCHEMA
-from errormotion.methods.multilateration.settings import Settings as MultilaterationSettings
+from errormotion.methods.multilateration.settings import MultilaterationSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:

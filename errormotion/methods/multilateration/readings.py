@@ -18,7 +18,7 @@ from errormotion.methods.multilateration.settings import ASSUMED_SCALE
 if TYPE_CHECKING:
     import xarray as xr
 
-    from errormotion.methods.multilateration.settings import Air, Expansion, Settings
+    from errormotion.methods.multilateration.settings import Air, Expansion, MultilaterationSettings
 
 _NAMED = 8
 
@@ -151,7 +151,7 @@ def listed(names: list[str], which: Iterable[int]) -> str:
     return ", ".join(some[:_NAMED]) + (f" and {len(some) - _NAMED} more" if len(some) > _NAMED else "")
 
 
-def assumptions(raw: xr.Dataset, settings: Settings) -> list[str]:
+def assumptions(raw: xr.Dataset, settings: MultilaterationSettings) -> list[str]:
     """Return a note on each quantity that is assumed."""
     notes = []
     if settings.scale_uncertainty is None:

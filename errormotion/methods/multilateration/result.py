@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from errormotion.estimation.sources import Errors
     from errormotion.measurement.observed import Observed, Solved
-    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.settings import MultilaterationSettings
 
 CERTIFIED = {
     "air temperature": ("thermometer", "offset"),
@@ -56,7 +56,7 @@ NOTHING = 1e-3
 """Scatter, relative to the noise, below which readings are expected ones: there are no errors of axes to be fitted."""
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, settings: MultilaterationSettings) -> Observed:
     """Return the model of raw data.
 
     Raises
@@ -121,7 +121,12 @@ def observe(raw: xr.Dataset, settings: Settings) -> Observed:
 
 
 def _drift(
-    reading: Array, data: Readings, e: Array, machine: Repeatability, settings: Settings, notes: list[str]
+    reading: Array,
+    data: Readings,
+    e: Array,
+    machine: Repeatability,
+    settings: MultilaterationSettings,
+    notes: list[str],
 ) -> tuple[Drift | None, Repeatability]:
     """Return drift and repeatability by returns: each is estimated with the other one known."""
     if settings.drift == "none" or settings.together:
@@ -164,7 +169,7 @@ class _Finish:
     """
 
     data: Readings
-    settings: Settings
+    settings: MultilaterationSettings
     machine: Repeatability
     drift: Drift | None
     reading: Array

@@ -193,7 +193,7 @@ class Measuring(PluginSettings):
     )
 
 
-class Settings(PluginSettings):
+class MultilaterationSettings(PluginSettings):
     """Settings of ``multilateration``."""
 
     layout: Layout = Field(default_factory=Layout, description="the layout that is measured or planned")

@@ -23,7 +23,7 @@ from errormotion.methods.multilateration.start import Stations, readings
 from errormotion.twin import VirtualMachine, truth
 
 if TYPE_CHECKING:
-    from errormotion.methods.multilateration.settings import Settings
+    from errormotion.methods.multilateration.settings import MultilaterationSettings
 
 REFLECTOR = (0.02, -0.01, -0.08)
 """Position of the reflector with all axes at zero, m."""
@@ -37,14 +37,14 @@ STATION_UNCERTAINTY = 5e-3
 _M, _S = {"units": "m"}, {"units": "s"}
 
 
-def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def simulate(settings: MultilaterationSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return raw data of the layout of the settings on a virtual C-frame, and the true errors of its targets.
 
     Every source of the measurement model is drawn once.
 
     Parameters
     ----------
-    settings : Settings
+    settings : MultilaterationSettings
     seed : int
         Of the machine and of the measurement.
 
@@ -61,7 +61,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     class OnMachine(Multilateration):
         """The method with readings of the machine as expected ones."""
 
-        def expected(self, settings: Settings) -> xr.Dataset:
+        def expected(self, settings: MultilaterationSettings) -> xr.Dataset:
             exact = super().expected(settings)
             position = (exact["target_nominal"] - exact["reflector"]).transpose("target", "direction").values
             _require_within_travel(machine, position)

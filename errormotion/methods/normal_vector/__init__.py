@@ -8,6 +8,6 @@ and ``identify`` combines them.
 """
 
 from errormotion.methods.normal_vector.method import NormalVector
-from errormotion.methods.normal_vector.settings import Ball, Event, Settings
+from errormotion.methods.normal_vector.settings import Ball, Event, NormalVectorSettings
 
-__all__ = ["Ball", "Event", "NormalVector", "Settings"]
+__all__ = ["Ball", "Event", "NormalVector", "NormalVectorSettings"]

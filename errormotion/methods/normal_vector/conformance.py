@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import partial
 
 from errormotion.methods.normal_vector.method import NormalVector
-from errormotion.methods.normal_vector.settings import Event, Settings
+from errormotion.methods.normal_vector.settings import Event, NormalVectorSettings
 from errormotion.methods.normal_vector.simulation import simulate
 from errormotion.plugins import MethodSubject
 
 FUNCTIONAL_POINT = (0.0, 0.0, 0.15)
 """m."""
-WARM_UP = Settings(
+WARM_UP = NormalVectorSettings(
     tool_axes="Z", functional_point=FUNCTIONAL_POINT, duration=3600.0, schedule=(Event(at=0.0, spindle_speed=12000.0),)
 )
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.normal_vector.schema import SCHEMA
-from errormotion.methods.normal_vector.settings import Settings as BallSettings
+from errormotion.methods.normal_vector.settings import NormalVectorSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class NormalVector(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = BallSettings
+    Settings: ClassVar[type[PluginSettings]] = NormalVectorSettings
     raw_schemas = lazy("errormotion.methods.normal_vector.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.normal_vector.report:chapters")
     texts = lazy("errormotion.methods.normal_vector.report:texts")
@@ -51,7 +51,7 @@ class NormalVector(ModelMethod):
     def acquire(
         self,
         bench: Bench,
-        settings: BallSettings,
+        settings: NormalVectorSettings,
         *,
         inputs: Mapping[str, xr.Dataset],  # noqa: ARG002 - part of the protocol
         done: xr.Dataset | None = None,
@@ -61,7 +61,9 @@ class NormalVector(ModelMethod):
 
         return acquisition.acquire(bench, settings, done)
 
-    def programs(self, settings: BallSettings, instruments: Mapping[str, Any] | None = None) -> Mapping[str, str]:
+    def programs(
+        self, settings: NormalVectorSettings, instruments: Mapping[str, Any] | None = None
+    ) -> Mapping[str, str]:
         """Return the NC programs of the test, file name to text.
 
         The tip radius is that of the settings, else that of the bench's touch probe.
@@ -71,7 +73,7 @@ class NormalVector(ModelMethod):
         tip = getattr((instruments or {}).get("touch_probe"), "tip_radius", None)
         return programs(settings if settings.tip_radius or not tip else settings.model_copy(update={"tip_radius": tip}))
 
-    def check(self, settings: BallSettings) -> dict[str, str]:
+    def check(self, settings: NormalVectorSettings) -> dict[str, str]:
         """Return the settings with which no campaign is possible: too few balls, or no cycle after the cold one."""
         found = {}
         if len(settings.balls) < 3:
@@ -87,7 +89,7 @@ class NormalVector(ModelMethod):
         """Return the axes that carry the tool."""
         return {"tool_axes": machine.tool_axes}
 
-    def check_machine(self, settings: BallSettings, machine: MachineDescription) -> dict[str, str]:
+    def check_machine(self, settings: NormalVectorSettings, machine: MachineDescription) -> dict[str, str]:
         """Return what contradicts the machine: other axes that carry the tool."""
         if settings.tool_axes == machine.tool_axes:
             return {}
@@ -97,7 +99,7 @@ class NormalVector(ModelMethod):
 
     def check_bench(
         self,
-        settings: BallSettings,  # noqa: ARG002 - part of the protocol
+        settings: NormalVectorSettings,  # noqa: ARG002 - part of the protocol
         bench: Bench,
         inputs: Collection[str],  # noqa: ARG002 - part of the protocol
     ) -> list[str]:
@@ -108,38 +110,38 @@ class NormalVector(ModelMethod):
         commanded = (["touch_probe"] if active else []) + (["controller"] if driven else [])
         return [text for kind in commanded for text in unarmed(bench, kind)]
 
-    def progress(self, settings: BallSettings) -> float:
+    def progress(self, settings: NormalVectorSettings) -> float:
         """Return the number of probing cycles, including the cold one."""
         from errormotion.methods.normal_vector.acquisition.cycle import cycles
 
         return float(cycles(settings))
 
-    def follow(self, settings: BallSettings) -> Callable[[xr.Dataset], str]:
+    def follow(self, settings: NormalVectorSettings) -> Callable[[xr.Dataset], str]:
         """Return a function that reports the displacement of the balls after each cycle; see ``live``."""
         from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 
         return LiveBalls(settings).update
 
-    def observe(self, raw: xr.Dataset, settings: BallSettings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: NormalVectorSettings) -> Observed:
         """Return the touches as a problem of least squares; see ``model``."""
         from errormotion.methods.normal_vector.result import observe
 
         return observe(raw, settings)
 
-    def expected(self, settings: BallSettings) -> xr.Dataset:
+    def expected(self, settings: NormalVectorSettings) -> xr.Dataset:
         """Return the touches of a machine without errors; see ``planning``."""
         from errormotion.methods.normal_vector.planning import expected
 
         return expected(settings)
 
-    def identify(self, raw: xr.Dataset, settings: BallSettings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: NormalVectorSettings | None = None) -> xr.Dataset:
         """Turn a raw dataset into an error dataset of component ``tool`` over ``time``.
 
         Parameters
         ----------
         raw : Dataset
             Schema ``errormotion.raw.normal_vector/1``, either variant; not modified.
-        settings : Settings, optional
+        settings : NormalVectorSettings, optional
 
         Raises
         ------
@@ -151,9 +153,9 @@ class NormalVector(ModelMethod):
         from errormotion.datasets.validation import checked_raw
         from errormotion.methods.normal_vector.result import identified
 
-        return identified(self, checked_raw(raw, self), settings or BallSettings())
+        return identified(self, checked_raw(raw, self), settings or NormalVectorSettings())
 
-    def planning_settings(self, settings: BallSettings, instruments: Mapping[str, Any]) -> BallSettings:
+    def planning_settings(self, settings: NormalVectorSettings, instruments: Mapping[str, Any]) -> NormalVectorSettings:
         """Return the settings with tip radius and noise of a touch of the probe on the bench, where they state none."""
         probe = instruments.get("touch_probe")
         stated = {"tip_radius": getattr(probe, "tip_radius", None), "touch_noise": getattr(probe, "noise", None)}
@@ -161,8 +163,8 @@ class NormalVector(ModelMethod):
             update={name: value for name, value in stated.items() if value and getattr(settings, name) is None}
         )
 
-    def plan(self, settings: BallSettings | None = None) -> xr.Dataset:
+    def plan(self, settings: NormalVectorSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros over the cycles with the expected covariance. See ``planning``."""
         from errormotion.methods.normal_vector.planning import plan
 
-        return plan(self, settings or BallSettings())
+        return plan(self, settings or NormalVectorSettings())

@@ -45,7 +45,7 @@ from errormotion.methods.normal_vector.identification.spheres import Observation
 if TYPE_CHECKING:
     import xarray as xr
 
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 T = TypeVar("T")
 COLD = "cold reference"
@@ -68,7 +68,7 @@ class Known(NamedTuple, Generic[T]):
     centre: T
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Probing]:
+def observe(raw: xr.Dataset, settings: NormalVectorSettings) -> tuple[Observed, Probing]:
     """Return the touches, or centres, of a raw dataset as a problem of least squares, and how it is stated.
 
     Raises
@@ -354,7 +354,7 @@ class Probing:
         )
 
 
-def _motion(data: Readings, settings: Settings) -> Motion:
+def _motion(data: Readings, settings: NormalVectorSettings) -> Motion:
     """Return the model of the motion; check the balls."""
     seen, names = data.seen, data.names
     ever = np.any(seen.valid, axis=(0, 2))

@@ -20,7 +20,7 @@ from errormotion.methods.normal_vector.identification.freedoms import Motion, ch
 from errormotion.methods.normal_vector.schema import RESULT, SCHEMA
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 NOISE = 0.25e-6
 """Noise of a touch where the settings have none, m."""
@@ -33,7 +33,7 @@ MEASURED = [*(name for name in RESULT if name not in PLANNED), "cycle_time", "di
 _M, _S = {"units": "m"}, {"units": "s"}
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: NormalVectorSettings) -> xr.Dataset:
     """Return the touches of a machine without errors; those of a cycle are simultaneous.
 
     No source of the model multiplies an error, so that errors of typical size would have the same uncertainty.
@@ -73,7 +73,7 @@ def expected(settings: Settings) -> xr.Dataset:
     )
 
 
-def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
+def plan(method: ModelMethod, settings: NormalVectorSettings) -> xr.Dataset:
     """Return an error dataset of zeros over the cycles, with the covariance expected from balls, touches and noise.
 
     ``normals_loss(dof)`` is the uncertainty of the published construction relative to that of the fit; ``notes`` state
@@ -94,7 +94,7 @@ def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
     return ds.assign_attrs(notes=_notes(settings, found["covariance"].values[-1], loss), tool_axes=settings.tool_axes)
 
 
-def _notes(settings: Settings, covariance: Array, loss: Array) -> list[str]:
+def _notes(settings: NormalVectorSettings, covariance: Array, loss: Array) -> list[str]:
     motion = Motion(settings.tool_axes, np.zeros(3))
     u = np.sqrt(np.diagonal(covariance))
     stated = ", ".join(f"{DOF[k]} {format_quantity(float(u[k]), 'um' if k < 3 else 'arcsec', 3)}" for k in motion.seen)

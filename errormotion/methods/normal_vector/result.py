@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.normal_vector.identification.reading import Readings
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class Excluded:
         return cls(wrong, moves, lost)
 
 
-def identified(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
+def identified(method: ModelMethod, raw: xr.Dataset, settings: NormalVectorSettings) -> xr.Dataset:
     """Return the error dataset of raw data that follow their schema.
 
     Raises
@@ -95,13 +95,13 @@ def identified(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.D
     return found.assign_attrs(tool_axes=str(raw.attrs.get("tool_axes", settings.tool_axes)))
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, settings: NormalVectorSettings) -> Observed:
     """Return the model of raw data, with what its solution says besides the errors; see `model.observe`."""
     observed, probing = model.observe(raw, settings)
     return replace(observed, finish=lambda solved: finished(solved, probing, settings, observed.notes))
 
 
-def finished(solved: Solved, probing: Probing, settings: Settings, notes: Sequence[str]) -> Solved:
+def finished(solved: Solved, probing: Probing, settings: NormalVectorSettings, notes: Sequence[str]) -> Solved:
     """Return a solution with times, notes and further variables; with ``procedure = normals`` with their errors.
 
     Raises
@@ -175,7 +175,7 @@ def _published(
     excluded: Excluded,
     anchor: Array,
     reach: Array,
-    settings: Settings,
+    settings: NormalVectorSettings,
     noise: float,
 ) -> tuple[Errors | None, str]:
     """Return the result of the published construction from four balls; None, and why, if it is not applicable."""

@@ -32,7 +32,7 @@ class Event(PluginSettings):
     spindle_speed: Speed = Field(ge=0, description="spindle speed from this time on, 1/min")
 
 
-class Settings(PluginSettings):
+class NormalVectorSettings(PluginSettings):
     """Settings of ``normal_vector``."""
 
     # Balls and touches
@@ -127,7 +127,7 @@ class Settings(PluginSettings):
     )
 
     @model_validator(mode="after")
-    def _fits(self) -> Settings:
+    def _fits(self) -> NormalVectorSettings:
         names = [ball.name or str(i + 1) for i, ball in enumerate(self.balls)]
         if len(set(names)) < len(names):
             raise ValueError(f"balls: expected different names; found {', '.join(names)}")

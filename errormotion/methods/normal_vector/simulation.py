@@ -19,7 +19,7 @@ from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.artefacts.balls import Balls, Probe
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 Moved = tuple[int, float, ArrayLike]
 
@@ -40,7 +40,7 @@ _M, _S = {"units": "m"}, {"units": "s"}
 _AROUND_AND_TOP = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1)], dtype=float)
 
 
-def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def simulate(settings: NormalVectorSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return touches during a warm-up of the virtual machine, and its true errors relative to the cold cycle.
 
     ``tool_axes`` selects the machine: the gantry (``XYZ``) or the C-frame (``Z``). The balls are those of the virtual
@@ -48,7 +48,7 @@ def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
     Parameters
     ----------
-    settings : Settings
+    settings : NormalVectorSettings
         Of these, ``tool_axes``, ``functional_point``, ``touches``, ``interval``, ``duration``, ``schedule`` and the
         number of ``balls`` are used.
     seed : int

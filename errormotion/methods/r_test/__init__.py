@@ -4,6 +4,6 @@
 """
 
 from errormotion.methods.r_test.method import RTest
-from errormotion.methods.r_test.settings import Settings
+from errormotion.methods.r_test.settings import RTestSettings
 
-__all__ = ["RTest", "Settings"]
+__all__ = ["RTest", "RTestSettings"]

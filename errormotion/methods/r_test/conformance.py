@@ -8,7 +8,7 @@ import numpy as np
 
 from errormotion.kinematics.iso import direction_of
 from errormotion.methods.r_test.method import RTest
-from errormotion.methods.r_test.settings import Settings
+from errormotion.methods.r_test.settings import RTestSettings
 from errormotion.plugins import MethodSubject
 
 
@@ -16,12 +16,12 @@ def subjects() -> tuple[MethodSubject, ...]:
     """Return the subjects; a single sphere leaves no redundancy, so that its noise must be stated."""
     optional = ("position_uncertainty", "nest_uncertainty")
     return (
-        _subject("three spheres", Settings(), (*optional, "displacement_noise")),
-        _subject("one sphere", Settings(axis="A", spheres=1, angles=24), optional),
+        _subject("three spheres", RTestSettings(), (*optional, "displacement_noise")),
+        _subject("one sphere", RTestSettings(axis="A", spheres=1, angles=24), optional),
     )
 
 
-def _subject(name: str, settings: Settings, optional: tuple[str, ...]) -> MethodSubject:
+def _subject(name: str, settings: RTestSettings, optional: tuple[str, ...]) -> MethodSubject:
     """Return a subject; its frame is turned about the axis only, whose letter states its direction."""
     x, y, z = map(float, 0.4 * np.eye(3)[direction_of(settings.axis)])
     return MethodSubject(

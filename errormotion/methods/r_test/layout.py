@@ -26,7 +26,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.chains import parse_chain
 from errormotion.kinematics.iso import DOF, ROTARY_AXES, direction_of, location_names
 from errormotion.methods.r_test.schema import READINGS, SCHEMA
-from errormotion.methods.r_test.settings import Settings
+from errormotion.methods.r_test.settings import RTestSettings
 
 ON_AXIS = 0.1e-3
 """Distance from the axis up to which a rotation has no effect, m: 100 urad displace such a sphere by 10 nm."""
@@ -225,7 +225,7 @@ class Layout:
         return {name: DOF.index(dof) for dof, name in location_names(self.axis).items()}
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: RTestSettings) -> xr.Dataset:
     """Return the readings without noise of a test with errors of typical size."""
     k = direction_of(settings.axis)
     angle = np.arange(settings.angles) * 2 * np.pi / settings.angles

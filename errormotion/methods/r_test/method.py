@@ -13,7 +13,7 @@ from errormotion.arrays import Array
 from errormotion.errors import MethodError
 from errormotion.measurement import Block, Constant, Datum, ModelMethod, Noise, Observed, Places, Problem
 from errormotion.methods.r_test.schema import ASSUMED_POSITION, SCHEMA
-from errormotion.methods.r_test.settings import Settings as TestSettings
+from errormotion.methods.r_test.settings import RTestSettings
 from errormotion.plugins import FigureOfMerit, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class RTest(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = TestSettings
+    Settings: ClassVar[type[PluginSettings]] = RTestSettings
     raw_schemas = lazy("errormotion.methods.r_test.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.r_test.conformance:subjects")
     chapters = lazy("errormotion.methods.r_test.report:chapters")

@@ -10,7 +10,7 @@ from errormotion.datasets.units import Angle, Length
 from errormotion.plugins import PluginSettings
 
 
-class Settings(PluginSettings):
+class RTestSettings(PluginSettings):
     """A test with spheres on a circle about the axis, for the plan."""
 
     axis: Literal["A", "B", "C"] = Field(default="C", description="the rotary axis, on the workpiece side")

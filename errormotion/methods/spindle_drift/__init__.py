@@ -7,6 +7,6 @@ and ``iso230_3`` evaluates the values of ISO 230-3. Source: Geiselhart et al. (e
 """
 
 from errormotion.methods.spindle_drift.method import SpindleDrift
-from errormotion.methods.spindle_drift.settings import Event, Settings
+from errormotion.methods.spindle_drift.settings import Event, SpindleDriftSettings
 
-__all__ = ["Event", "Settings", "SpindleDrift"]
+__all__ = ["Event", "SpindleDrift", "SpindleDriftSettings"]

@@ -6,7 +6,7 @@ import math
 from functools import partial
 
 from errormotion.methods.spindle_drift.method import SpindleDrift
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 from errormotion.methods.spindle_drift.simulation import simulate
 from errormotion.plugins import MethodSubject
 
@@ -22,7 +22,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     """
     drift = MethodSubject(
         SpindleDrift,
-        partial(simulate, Settings(duration=DURATION)),
+        partial(simulate, SpindleDriftSettings(duration=DURATION)),
         name="drift",
         settings={"functional_point": (0.0, 0.0, 0.0)},
         setting_vectors={"functional_point": "point"},
@@ -39,7 +39,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     )
     beams = MethodSubject(
         SpindleDrift,
-        partial(simulate, Settings(procedure="beam_detection")),
+        partial(simulate, SpindleDriftSettings(procedure="beam_detection")),
         name="beam_detection",
         settings={"procedure": "beam_detection"},
         raw_vectors={

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.spindle_drift.schema import SCHEMA
-from errormotion.methods.spindle_drift.settings import Settings as DriftSettings
-from errormotion.methods.spindle_drift.settings import TrialSettings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings, TrialSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ class SpindleDrift(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = DriftSettings
+    Settings: ClassVar[type[PluginSettings]] = SpindleDriftSettings
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
     texts = lazy("errormotion.methods.spindle_drift.report:texts")
@@ -48,7 +47,12 @@ class SpindleDrift(ModelMethod):
     conformance = lazy("errormotion.methods.spindle_drift.conformance:subjects")
 
     def acquire(
-        self, bench: Bench, settings: DriftSettings, *, inputs: Mapping[str, xr.Dataset], done: xr.Dataset | None = None
+        self,
+        bench: Bench,
+        settings: SpindleDriftSettings,
+        *,
+        inputs: Mapping[str, xr.Dataset],
+        done: xr.Dataset | None = None,
     ) -> Iterator[xr.Dataset]:
         """Measure; yield raw datasets to be joined along ``append_dim``.
 
@@ -62,7 +66,7 @@ class SpindleDrift(ModelMethod):
             return scanning.detect_beams(bench, settings, done)
         return acquisition.record_drift(bench, settings, given_beams(inputs), done)
 
-    def check_machine(self, settings: DriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
+    def check_machine(self, settings: SpindleDriftSettings, machine: MachineDescription) -> dict[str, str]:  # noqa: ARG002
         """Return what contradicts the machine: a spindle axis other than Z, the axis of the measuring frame."""
         if machine.spindle_axis == "Z":
             return {}
@@ -73,7 +77,7 @@ class SpindleDrift(ModelMethod):
 
     def check_bench(
         self,
-        settings: DriftSettings,
+        settings: SpindleDriftSettings,
         bench: Bench,
         inputs: Collection[str],  # noqa: ARG002 - part of the protocol
     ) -> list[str]:
@@ -87,11 +91,11 @@ class SpindleDrift(ModelMethod):
             return []
         return unarmed(bench, "controller")
 
-    def append_dim(self, settings: DriftSettings) -> str:
+    def append_dim(self, settings: SpindleDriftSettings) -> str:
         """Return ``sample`` for a beam detection (scan after scan), ``time`` for a drift record."""
         return "sample" if settings.procedure == "beam_detection" else "time"
 
-    def progress(self, settings: DriftSettings) -> float:
+    def progress(self, settings: SpindleDriftSettings) -> float:
         """Return the expected length of the record, s."""
         if settings.procedure == "beam_detection":
             from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
@@ -99,7 +103,7 @@ class SpindleDrift(ModelMethod):
             return 5 * 2 * len(settings.depths) * scan_seconds(settings.steps, settings.dwell)
         return settings.duration
 
-    def follow(self, settings: DriftSettings) -> Callable[[xr.Dataset], str]:
+    def follow(self, settings: SpindleDriftSettings) -> Callable[[xr.Dataset], str]:
         """Return a function that describes each acquired chunk in a line of text."""
         if settings.procedure == "beam_detection":
             return _beam_text
@@ -107,7 +111,7 @@ class SpindleDrift(ModelMethod):
 
         return LiveDrift(settings).update
 
-    def identify(self, raw: xr.Dataset, settings: DriftSettings | None = None) -> xr.Dataset:
+    def identify(self, raw: xr.Dataset, settings: SpindleDriftSettings | None = None) -> xr.Dataset:
         """Return the error dataset of a raw dataset: of component ``spindle`` for a drift, ``beam`` for a detection.
 
         The raw dataset is not modified, and may be larger than memory. Errors as for `ModelMethod.identify`.
@@ -117,21 +121,23 @@ class SpindleDrift(ModelMethod):
         from errormotion.datasets.validation import checked_raw
         from errormotion.methods.spindle_drift.identification.detection import identify_beams
 
-        return identify_beams(checked_raw(raw, self), settings or DriftSettings(), self.info.id, self.info.version)
+        return identify_beams(
+            checked_raw(raw, self), settings or SpindleDriftSettings(), self.info.id, self.info.version
+        )
 
-    def observe(self, raw: xr.Dataset, settings: DriftSettings) -> Observed:
+    def observe(self, raw: xr.Dataset, settings: SpindleDriftSettings) -> Observed:
         """Return what a drift record means; see ``model``."""
         from errormotion.methods.spindle_drift.model import observe
 
         return observe(raw, settings)
 
-    def expected(self, settings: DriftSettings) -> xr.Dataset:
+    def expected(self, settings: SpindleDriftSettings) -> xr.Dataset:
         """Return the raw data of a test without noise; see ``planning``."""
         from errormotion.methods.spindle_drift.planning import expected
 
         return expected(settings)
 
-    def planning_settings(self, settings: DriftSettings, instruments: Mapping[str, Any]) -> DriftSettings:
+    def planning_settings(self, settings: SpindleDriftSettings, instruments: Mapping[str, Any]) -> SpindleDriftSettings:
         """Return the settings with bar, levels, noise and expansion of the frame on the bench, where none is stated."""
         frame = instruments.get("spindle_frame")
         names = {"bar_radius": "bar_radius", "levels": "levels", "noise": "noise"}
@@ -142,16 +148,16 @@ class SpindleDrift(ModelMethod):
         update = {name: value for name, value in found.items() if value is not None and name not in stated}
         return settings.model_copy(update={"layout": settings.layout.model_copy(update=update)})
 
-    def plan(self, settings: DriftSettings | None = None) -> xr.Dataset:
+    def plan(self, settings: SpindleDriftSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance."""
-        its = TrialSettings.of(settings or DriftSettings())
+        its = TrialSettings.of(settings or SpindleDriftSettings())
         if its.procedure == "beam_detection":
             from errormotion.methods.spindle_drift.planning import plan_beams
 
             return plan_beams(its, self.info.id, self.info.version)
         return super().plan(its)
 
-    def redrawing(self, raw: xr.Dataset, settings: DriftSettings, errors: xr.Dataset) -> Redrawing:
+    def redrawing(self, raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> Redrawing:
         """Return the sources of the uncertainty of raw data, for the Monte Carlo evaluation."""
         if "sphere_radius" in raw:
             from errormotion.methods.spindle_drift.redrawing import redrawing_of_beams

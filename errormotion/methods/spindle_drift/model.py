@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.spindle_drift.identification.record import Record
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 T = TypeVar("T")
 UNSEEN = "rotation about the spindle axis"
@@ -205,7 +205,7 @@ class Seen:
         return n[0] * p[:, 0] + n[1] * p[:, 1] + n[2] * p[:, 2]
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, settings: SpindleDriftSettings) -> Observed:
     """Return what a drift record means.
 
     Raises
@@ -346,7 +346,7 @@ def _constants(
     raw: xr.Dataset,
     record: Record,
     setup: Setup,
-    settings: Settings,
+    settings: SpindleDriftSettings,
     reference: NDArray[np.int64],
     parts: list[Array] | None,
 ) -> Known[Constant]:

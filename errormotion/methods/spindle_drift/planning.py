@@ -15,7 +15,7 @@ from errormotion.methods.spindle_drift.identification.detection import identify_
 from errormotion.methods.spindle_drift.schema import CHANNELS, PLANNED, SCHEMA
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 _PLANNED = "planned, not measured"
 _TYPICAL_DRIFT = np.array([5e-6, 5e-6, 20e-6, 1e-4, 1e-4])  # EX, EY, EZ, m; EA, EB, rad
@@ -27,7 +27,7 @@ _LATER = 3600.0
 """Time of the planned instant after the reference state, s."""
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: SpindleDriftSettings) -> xr.Dataset:
     """Return raw data without noise, for the procedure of the settings.
 
     A frame is as drawn in ISO 230-3, with readings at mid-range.
@@ -35,14 +35,14 @@ def expected(settings: Settings) -> xr.Dataset:
     return _expected_beams(settings) if settings.procedure == "beam_detection" else _expected_drift(settings)
 
 
-def plan_beams(settings: Settings, method: str, version: str) -> xr.Dataset:
+def plan_beams(settings: SpindleDriftSettings, method: str, version: str) -> xr.Dataset:
     """Return the identification of the expected beam detection, with values of 0."""
     found = identify_beams(_expected_beams(settings), settings, method, version)
     kept = found[[*DOF, "covariance", "beam_index"]].assign({name: 0.0 * found[name] for name in DOF})
     return kept.assign_attrs(reference=_PLANNED)
 
 
-def _frame(settings: Settings) -> tuple[Array, Array]:
+def _frame(settings: SpindleDriftSettings) -> tuple[Array, Array]:
     """Return origins and directions (5, 3) of the beams of a frame."""
     p = settings.layout
     near = p.bar_radius + p.standoff
@@ -51,7 +51,7 @@ def _frame(settings: Settings) -> tuple[Array, Array]:
     return origin, np.array([[-1.0, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]])
 
 
-def _expected_drift(settings: Settings) -> xr.Dataset:
+def _expected_drift(settings: SpindleDriftSettings) -> xr.Dataset:
     """Return the means of the reference state, and of one later instant.
 
     The beams are those of a detection with the stated steps. The later instant has a typical drift (5 um in X and Y,
@@ -92,7 +92,7 @@ def _expected_drift(settings: Settings) -> xr.Dataset:
     return xr.Dataset(variables, labels, _ATTRS)
 
 
-def _expected_beams(settings: Settings) -> xr.Dataset:
+def _expected_beams(settings: SpindleDriftSettings) -> xr.Dataset:
     """Return readings of a stepped sphere whose residuals have exactly the stated noise.
 
     The noise of a detection is that of its residuals. Readings without any would have no uncertainty: pseudo-random
@@ -124,7 +124,7 @@ def _expected_beams(settings: Settings) -> xr.Dataset:
     return xr.Dataset(variables, {key: _LABELS[key] for key in ("channel", "direction")}, _ATTRS)
 
 
-def _centres(origin: Array, direction: Array, settings: Settings) -> Array:
+def _centres(origin: Array, direction: Array, settings: SpindleDriftSettings) -> Array:
     """Return the centres (profile, step, 3) of the sphere: at each depth, scans along both axes across the beam."""
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
     middle = origin + (np.array(settings.depths) + settings.sphere_radius)[:, None] * direction

@@ -13,24 +13,30 @@ from errormotion.methods.spindle_drift.settings import TrialSettings
 from errormotion.plugins import Redraw, Redrawing, replaced
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
-def redrawing_of_beams(raw: xr.Dataset, settings: Settings, errors: xr.Dataset) -> Redrawing:
+def redrawing_of_beams(raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> Redrawing:
     """Return the readings of the stepped sphere, with the noise of each beam's residuals; radius; and scales."""
     steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
     steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
     sigma = errors["noise"].sel(beam=[str(name) for name in raw["channel"].values]).values[:, None, None]
 
-    def draw(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+    def draw(
+        raw: xr.Dataset, settings: SpindleDriftSettings, generator: np.random.Generator
+    ) -> tuple[xr.Dataset, SpindleDriftSettings]:
         distance = raw.variables["distance"].values
         return replaced(raw, {"distance": distance + sigma * generator.normal(size=distance.shape)}), settings
 
-    def radius(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+    def radius(
+        raw: xr.Dataset, settings: SpindleDriftSettings, generator: np.random.Generator
+    ) -> tuple[xr.Dataset, SpindleDriftSettings]:
         drawn = raw["sphere_radius"].values + raw["sphere_radius_uncertainty"].values * generator.normal()
         return replaced(raw, {"sphere_radius": drawn}), settings
 
-    def scales(raw: xr.Dataset, settings: Settings, generator: np.random.Generator) -> tuple[xr.Dataset, Settings]:
+    def scales(
+        raw: xr.Dataset, settings: SpindleDriftSettings, generator: np.random.Generator
+    ) -> tuple[xr.Dataset, SpindleDriftSettings]:
         centre = raw.variables["sphere_centre"].transpose("channel", "profile", "step", "direction")
         middle = np.nanmean(centre.values, axis=(0, 1, 2))
         factor = 1 + raw["position_scale_uncertainty"].values * generator.normal(size=3)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
     from errormotion.methods.spindle_drift.identification.record import Record
     from errormotion.methods.spindle_drift.identification.setup import Setup
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 REFERENCE = "reference state"
 """Group of the sources that are the uncertainty of the reference state."""
@@ -40,7 +40,7 @@ class Result:
     raw: xr.Dataset
     record: Record
     setup: Setup
-    settings: Settings
+    settings: SpindleDriftSettings
     reference: NDArray[np.int64]
     state: Array
     point: Array

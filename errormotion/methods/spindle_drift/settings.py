@@ -45,7 +45,7 @@ class Layout(PluginSettings):
     frame_warming: float = Field(default=1.0, ge=0, description="change of the temperature of the frame, K")
 
 
-class Settings(PluginSettings):
+class SpindleDriftSettings(PluginSettings):
     """Settings of ``spindle_drift``."""
 
     procedure: Literal["drift", "beam_detection"] = Field(
@@ -133,10 +133,10 @@ class Settings(PluginSettings):
     layout: Layout = Field(default_factory=Layout, description="set-up of a plan")
 
 
-class TrialSettings(Settings):
+class TrialSettings(SpindleDriftSettings):
     """Settings of a plan, or of one trial of the Monte Carlo method: without results that do not affect the errors."""
 
     @classmethod
-    def of(cls, settings: Settings) -> TrialSettings:
+    def of(cls, settings: SpindleDriftSettings) -> TrialSettings:
         """Return the same settings for a plan or a trial."""
-        return cls(**{name: getattr(settings, name) for name in Settings.model_fields})
+        return cls(**{name: getattr(settings, name) for name in SpindleDriftSettings.model_fields})

@@ -18,7 +18,7 @@ from errormotion.arrays import Array
 from errormotion.datasets import build_errors, provenance
 from errormotion.errors import BenchError
 from errormotion.methods.spindle_drift.schema import SCHEMA
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 from errormotion.twin import Event, VirtualMachine, intersections
 from errormotion.twin.sensors.frame import FrameGeometry
 from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE
@@ -42,7 +42,7 @@ _1 = {"units": "1"}
 _XYZ = np.eye(3)
 
 
-def simulate(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def simulate(settings: SpindleDriftSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     """Return raw data of the procedure stated in the settings, and the true errors.
 
     A drift has 24 instants, evenly spaced over ``duration``, and the spindle speeds of ``schedule`` (15000 1/min from
@@ -57,7 +57,7 @@ def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Da
     return truth.assign_coords(time=("time", errors["time"].values, {"units": "s"}))
 
 
-def _simulated_drift(settings: Settings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+def _simulated_drift(settings: SpindleDriftSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
     machine = _machine(seed, tuple((e.at, e.spindle_speed) for e in settings.schedule) or ((0.0, SPEED),))
     t = settings.duration / INSTANTS * np.arange(INSTANTS)
     raw = raw_drift(machine, t, seed=seed, beams=calibrated_beams(machine, seed), warm_up=False, radius_error=False)

@@ -6,6 +6,6 @@ turns, and ``figures`` the values of the standard.
 """
 
 from errormotion.methods.spindle_error_motion.method import SpindleErrorMotion
-from errormotion.methods.spindle_error_motion.settings import Settings
+from errormotion.methods.spindle_error_motion.settings import SpindleErrorMotionSettings
 
-__all__ = ["Settings", "SpindleErrorMotion"]
+__all__ = ["SpindleErrorMotion", "SpindleErrorMotionSettings"]

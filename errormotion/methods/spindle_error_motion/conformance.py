@@ -8,13 +8,13 @@ import numpy as np
 
 from errormotion.kinematics.iso import direction_of
 from errormotion.methods.spindle_error_motion.method import SpindleErrorMotion
-from errormotion.methods.spindle_error_motion.settings import Settings
+from errormotion.methods.spindle_error_motion.settings import SpindleErrorMotionSettings
 from errormotion.plugins import MethodSubject
 
 
 def subjects() -> tuple[MethodSubject, ...]:
     """Return the subjects."""
-    small = Settings(turns=48, sample_rate=3000.0, places=32, harmonics=8)
+    small = SpindleErrorMotionSettings(turns=48, sample_rate=3000.0, places=32, harmonics=8)
     horizontal = {"axis": "A", "sensors": "XYZ", "angle_from": "encoder", "spindle_speed": -3000.0}
     return (
         _subject("five sensors", small, ("position_uncertainty", "roundness", "index_time")),
@@ -26,7 +26,7 @@ def subjects() -> tuple[MethodSubject, ...]:
     )
 
 
-def _subject(name: str, settings: Settings, optional: tuple[str, ...]) -> MethodSubject:
+def _subject(name: str, settings: SpindleErrorMotionSettings, optional: tuple[str, ...]) -> MethodSubject:
     """Return a subject; its frame is turned about the axis only, whose letter states its direction."""
     x, y, z = map(float, 0.4 * np.eye(3)[direction_of(settings.axis)])
     return MethodSubject(

@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion.measurement import ModelMethod
 from errormotion.methods.spindle_error_motion.schema import SCHEMA
-from errormotion.methods.spindle_error_motion.settings import Settings as TestSettings
+from errormotion.methods.spindle_error_motion.settings import SpindleErrorMotionSettings
 from errormotion.plugins import FigureOfMerit, MethodInfo, Needs, PluginSettings, lazy
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class SpindleErrorMotion(ModelMethod):
         ),
     )
     needs: ClassVar[Needs] = Needs(instruments=(), raw_schema=SCHEMA)
-    Settings: ClassVar[type[PluginSettings]] = TestSettings
+    Settings: ClassVar[type[PluginSettings]] = SpindleErrorMotionSettings
     raw_schemas = lazy("errormotion.methods.spindle_error_motion.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.spindle_error_motion.conformance:subjects")
     chapters = lazy("errormotion.methods.spindle_error_motion.report:chapters")
@@ -48,7 +48,7 @@ class SpindleErrorMotion(ModelMethod):
         """Return what a record means; see ``model``."""
         from errormotion.methods.spindle_error_motion.model import observe
 
-        return observe(raw, settings or TestSettings())
+        return observe(raw, settings or SpindleErrorMotionSettings())
 
     def expected(self, settings: Any) -> xr.Dataset:
         """Return the readings of a spindle with typical error motions; see ``simulation``."""
@@ -93,6 +93,6 @@ class SpindleErrorMotion(ModelMethod):
 
 
 @lru_cache(maxsize=4)
-def _planned(settings: TestSettings) -> xr.Dataset:
+def _planned(settings: SpindleErrorMotionSettings) -> xr.Dataset:
     """Return the plan of a test, in whose form the truth of its simulations is stated; not to be changed."""
     return SpindleErrorMotion().plan(settings)

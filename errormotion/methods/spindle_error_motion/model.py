@@ -27,7 +27,7 @@ from errormotion.methods.spindle_error_motion.turning import TAU, Turning, turni
 
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
-    from errormotion.methods.spindle_error_motion.settings import Settings
+    from errormotion.methods.spindle_error_motion.settings import SpindleErrorMotionSettings
 
 T = TypeVar("T")
 MOTION = "asynchronous motion and noise"
@@ -70,7 +70,7 @@ class Record:
     turning: Turning
     mean: Synchronous
     angle: Array
-    settings: Settings
+    settings: SpindleErrorMotionSettings
 
     @property
     def curves(self) -> list[Curve]:
@@ -78,7 +78,7 @@ class Record:
         return curves_of(self.layout, self.angle, self.settings.sensitive_angle)
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, settings: SpindleErrorMotionSettings) -> Observed:
     """Return what a record means: mean reading = gain times displacement of the turning artefact, plus its form."""
     notes = list[str]()
     layout = Layout.of(raw)

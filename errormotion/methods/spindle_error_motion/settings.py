@@ -12,7 +12,7 @@ from errormotion.plugins import PluginSettings
 Sensors = Literal["X", "XY", "XYZ", "Z", "XYXYZ"]
 
 
-class Settings(PluginSettings):
+class SpindleErrorMotionSettings(PluginSettings):
     """The test to plan or to simulate, the evaluation, and the limits of the figures."""
 
     # The test

@@ -12,7 +12,7 @@ from errormotion.methods.spindle_error_motion.figures import centred, curves_of,
 from errormotion.methods.spindle_error_motion.layout import Layout
 from errormotion.methods.spindle_error_motion.model import FORM, PEAKS
 from errormotion.methods.spindle_error_motion.schema import SCHEMA
-from errormotion.methods.spindle_error_motion.settings import Settings
+from errormotion.methods.spindle_error_motion.settings import SpindleErrorMotionSettings
 from errormotion.twin.spindle import TAU, Spindle, displacements
 
 _FINE = 3600
@@ -22,7 +22,7 @@ _SEED = 7
 """Of the asynchronous motion of expected readings."""
 
 
-def spindle_of(settings: Settings) -> Spindle:
+def spindle_of(settings: SpindleErrorMotionSettings) -> Spindle:
     """Return the virtual spindle of a test."""
     return Spindle(
         speed=settings.spindle_speed,
@@ -31,7 +31,7 @@ def spindle_of(settings: Settings) -> Spindle:
     )
 
 
-def sensors_of(settings: Settings) -> tuple[Array, Array]:
+def sensors_of(settings: SpindleErrorMotionSettings) -> tuple[Array, Array]:
     """Return directions and positions of the sensors of a spindle along Z, (sensor, 3), m.
 
     The first direction is outward, the second inward, so that both signs occur.
@@ -51,7 +51,7 @@ def _turned(vectors: Array, axis: str) -> Array:
     return np.roll(vectors, direction_of(axis) - 2, axis=-1)
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: SpindleErrorMotionSettings) -> xr.Dataset:
     """Return the readings without noise of a spindle with error motions of typical size.
 
     They contain an asynchronous motion, the same one each time, whose scatter states the uncertainty of the plan.
@@ -60,7 +60,9 @@ def expected(settings: Settings) -> xr.Dataset:
     return _recorded(settings, spindle_of(settings), direction, position, np.random.default_rng(_SEED))[0]
 
 
-def simulate(settings: Settings, seed: int, spindle: Spindle | None = None) -> tuple[xr.Dataset, Array]:
+def simulate(
+    settings: SpindleErrorMotionSettings, seed: int, spindle: Spindle | None = None
+) -> tuple[xr.Dataset, Array]:
     """Return raw data with every source drawn once, and the motions that do not repeat at the samples, (n, 6)."""
     generator = np.random.default_rng(seed)
     spindle = spindle or spindle_of(settings)
@@ -88,7 +90,7 @@ def simulate(settings: Settings, seed: int, spindle: Spindle | None = None) -> t
 
 
 def _recorded(
-    settings: Settings,
+    settings: SpindleErrorMotionSettings,
     spindle: Spindle,
     direction: Array,
     position: Array,
@@ -132,7 +134,9 @@ def _in_frame(motion: Array, axis: str) -> Array:
     return np.concatenate([_turned(motion[:, :3], axis), _turned(motion[:, 3:], axis)], axis=1)
 
 
-def true_motion(settings: Settings, layout: Layout, angle: Array, spindle: Spindle | None = None) -> Array:
+def true_motion(
+    settings: SpindleErrorMotionSettings, layout: Layout, angle: Array, spindle: Spindle | None = None
+) -> Array:
     """Return the synchronous error motion relative to the axis average line, (place, 6); NaN where none is measured."""
     spindle = spindle or spindle_of(settings)
     shift = 0.0 if settings.angle_from != "eccentricity" else -float(np.angle(spindle.eccentricity))
@@ -148,7 +152,9 @@ def true_motion(settings: Settings, layout: Layout, angle: Array, spindle: Spind
     return np.asarray(np.where(layout.determined, E, np.nan))
 
 
-def truth_of(errors: xr.Dataset, settings: Settings, spindle: Spindle, raw: xr.Dataset, other: Array) -> xr.Dataset:
+def truth_of(
+    errors: xr.Dataset, settings: SpindleErrorMotionSettings, spindle: Spindle, raw: xr.Dataset, other: Array
+) -> xr.Dataset:
     """Return the true error motions and figures in the form of a result."""
     layout = Layout.of(raw)
     true = true_motion(settings, layout, errors["angle"].values, spindle)

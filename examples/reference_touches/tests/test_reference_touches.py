@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from reference_touches import ReferenceTouches, Settings
+from reference_touches import ReferenceTouches, ReferenceTouchesSettings
 
 from errormotion.testing import MethodConformance
 
@@ -12,7 +12,7 @@ class TestReferenceTouches(MethodConformance):
 
 
 def test_a_machine_that_shows_less_at_the_reference_is_too_far() -> None:
-    raw = ReferenceTouches().expected(Settings())
+    raw = ReferenceTouches().expected(ReferenceTouchesSettings())
     errors = ReferenceTouches().identify(raw)
     warm = 1 - np.exp(-7200 / 1800)
     for name, size in {"EX": 10e-6, "EY": -20e-6, "EZ": 30e-6}.items():
@@ -20,7 +20,7 @@ def test_a_machine_that_shows_less_at_the_reference_is_too_far() -> None:
 
 
 def test_a_stand_that_grows_is_no_drift() -> None:
-    raw = ReferenceTouches().expected(Settings())
+    raw = ReferenceTouches().expected(ReferenceTouchesSettings())
     higher = raw.assign(touch=raw["touch"] + 0.0)
     higher["touch"][:, 2] += 1e-6 * 0.2 * (raw["temperature"] - 20.0)
     change = ReferenceTouches().identify(higher)["EZ"] - ReferenceTouches().identify(raw)["EZ"]

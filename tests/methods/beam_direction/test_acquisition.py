@@ -10,7 +10,7 @@ from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.acquisition import measure_planes
 from errormotion.methods.beam_direction.planning import design
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 BEAM = np.array([np.sin(np.radians(21.0)), 0.01, -np.cos(np.radians(21.0))])
 BEAM /= np.linalg.norm(BEAM)
@@ -98,7 +98,7 @@ class Bench:
 
 
 def settings(**layout):
-    return Settings(layout=LAYOUT | layout)
+    return BeamDirectionSettings(layout=LAYOUT | layout)
 
 
 def joined(chunks):

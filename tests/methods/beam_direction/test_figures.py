@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
+from errormotion.methods.beam_direction import BeamDirection, BeamDirectionSettings, simulation
 from errormotion.twin import VirtualMachine
 
 
@@ -42,4 +42,4 @@ def test_a_check_bar_states_its_radius_and_residual(beam):
 
 @pytest.mark.usefixtures("no_search")
 def test_a_plan_has_no_figures():
-    assert BeamDirection.figures(BeamDirection().plan(Settings())) == []
+    assert BeamDirection.figures(BeamDirection().plan(BeamDirectionSettings())) == []

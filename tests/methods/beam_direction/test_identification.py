@@ -12,7 +12,7 @@ from errormotion.datasets import certificates, load, provenance, save, validate
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
+from errormotion.methods.beam_direction import BeamDirection, BeamDirectionSettings, simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.twin import VirtualMachine
 
@@ -39,7 +39,7 @@ def calibration(machine, tmp_path_factory):
 
 
 def identify(raw, **settings):
-    return BeamDirection().identify(raw, Settings(**settings))
+    return BeamDirection().identify(raw, BeamDirectionSettings(**settings))
 
 
 def notes(errors):
@@ -375,7 +375,7 @@ def test_simulated_data_have_every_source_drawn_once():
         "stage_uncertainty": 2e-5,
         "speckle": 0.3e-6,
     }
-    settings, method = Settings(layout=layout), BeamDirection()
+    settings, method = BeamDirectionSettings(layout=layout), BeamDirection()
     z = []
     for seed in range(60):
         raw, truth = method.simulate(settings, seed)

@@ -10,7 +10,10 @@ from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt_vector
 from errormotion.methods.beam_direction import simulation
-from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate
+from errormotion.methods.beam_direction.identification.inclination.calibrate import (
+    InclinationCalibrationSettings,
+    calibrate,
+)
 from errormotion.methods.beam_direction.identification.inclination.surface import degrees_to
 from errormotion.twin import VirtualMachine
 
@@ -258,13 +261,13 @@ def test_a_calibration_is_reproducible_and_states_its_source() -> None:
 
 
 def test_order_and_symmetry_may_be_given() -> None:
-    found = calibrate(readings(), Settings(order=3, mirror=False))
+    found = calibrate(readings(), InclinationCalibrationSettings(order=3, mirror=False))
     assert found.order == 3
     assert found.dataset.sizes["term"] == len(degrees_to(3, mirror=False)) == 10
     with pytest.raises(
         MethodError, match=r"order: expected fewer coefficients than different tilts, .*; found 55 at order 9"
     ):
-        calibrate(readings(), Settings(order=9, mirror=False))
+        calibrate(readings(), InclinationCalibrationSettings(order=9, mirror=False))
 
 
 def changed(**columns: object) -> xr.Dataset:
@@ -311,7 +314,7 @@ def test_readings_in_another_unit_are_refused(raw: xr.Dataset, expected: str) ->
 def test_readings_that_are_implausible_are_refused(raw: xr.Dataset, expected: str) -> None:
     if "30 readings more" in expected:
         with pytest.raises(MethodError, match=expected):
-            calibrate(raw, Settings(offsets="each"))
+            calibrate(raw, InclinationCalibrationSettings(offsets="each"))
         return
     with pytest.raises(MethodError, match=expected):
         calibrate(raw)
@@ -323,4 +326,4 @@ def test_a_setting_at_one_depth_is_refused() -> None:
     with pytest.raises(MethodError, match="inclination 0 deg at rotation 0 deg has readings at only one depth"):
         calibrate(raw)
     with pytest.raises(MethodError, match="has only one reading"):
-        calibrate(readings().isel(group=slice(10, None)), Settings(offsets="each"))
+        calibrate(readings().isel(group=slice(10, None)), InclinationCalibrationSettings(offsets="each"))

@@ -6,7 +6,7 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.planes import correlation_root, fit_planes
 from errormotion.methods.beam_direction.identification.reading import Readings
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 NOISE, SPECKLE, LENGTH = 0.1e-6, 0.3e-6, 50e-6
 G = np.array([0.42, -0.15, 1.2])
@@ -44,7 +44,9 @@ def readings(distance, stage=STAGE, speckle=0.0, names=("Plane 1",)):
 
 
 def fitted(distance, stage=STAGE, speckle=0.0, names=("Plane 1",), **settings):
-    return fit_planes(readings(distance, stage, speckle, names), Settings(**{"ordered": False, **settings}), [])
+    return fit_planes(
+        readings(distance, stage, speckle, names), BeamDirectionSettings(**{"ordered": False, **settings}), []
+    )
 
 
 def noisy(seed):
@@ -181,7 +183,7 @@ def test_errors_that_are_correlated_along_the_path_are_covered(phi):
 def test_a_correlation_is_noted():
     notes = []
     names, stage = tuple(f"Plane {i + 1}" for i in range(4)), np.broadcast_to(STAGE, (4, *STAGE.shape))
-    fit_planes(readings(correlated(0.8, 3), stage, 0.0, names), Settings(), notes)
+    fit_planes(readings(correlated(0.8, 3), stage, 0.0, names), BeamDirectionSettings(), notes)
     assert any("The noise of neighbouring readings is correlated (0." in note for note in notes)
 
 

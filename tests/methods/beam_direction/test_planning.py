@@ -12,10 +12,12 @@ from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
 from errormotion.methods.beam_direction import BeamDirection, simulation
-from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings as CalibrationSettings
-from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
+from errormotion.methods.beam_direction.identification.inclination.calibrate import (
+    InclinationCalibrationSettings,
+    calibrate,
+)
 from errormotion.methods.beam_direction.planning import design
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.twin import VirtualMachine
 
 BEAM = np.array([np.sin(np.radians(20)), 0.0, -np.cos(np.radians(20))])
@@ -153,7 +155,7 @@ def test_impossible_plans_are_refused():
 
 def settings(**changes):
     layout = {"nominal_direction": tuple(BEAM), "triangulation_normal": (0.0, 1.0, 0.0)}
-    return Settings(layout=layout | changes.pop("layout", {}), **{"receiver": "right", **changes})
+    return BeamDirectionSettings(layout=layout | changes.pop("layout", {}), **{"receiver": "right", **changes})
 
 
 @pytest.mark.usefixtures("short_search")
@@ -186,7 +188,7 @@ def test_a_measurement_has_the_uncertainty_of_its_plan():
     raw = simulation.raw(
         machine, [tuple(pair) for pair in angles], stage=np.array(stage), seed=7, inclination_error=False
     )
-    found = BeamDirection().identify(raw, Settings(noise="stated"))
+    found = BeamDirection().identify(raw, BeamDirectionSettings(noise="stated"))
     u, expected = (np.sqrt(np.diagonal(ds["covariance"].values[0])[3:]) for ds in (found, planned))
     # Both are uncertainties of rotations from the nominal direction; the two differ by 0.6 deg (1 %).
     np.testing.assert_allclose(u, expected, rtol=0.02)
@@ -222,7 +224,7 @@ def test_a_set_up_with_a_path_is_planned_with_its_positions():
 def calibration(tmp_path_factory):
     """Return the path of a calibration with the holes of the published one: rotations 0 to 10, 90, 170 to 180 deg."""
     raw = simulation.raw_inclination(VirtualMachine("cframe", seed=3), seed=1)
-    return calibrate(raw, CalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
+    return calibrate(raw, InclinationCalibrationSettings()).save(tmp_path_factory.mktemp("lab") / "sensor.nc")
 
 
 @pytest.mark.usefixtures("short_search")

@@ -7,9 +7,11 @@ from errormotion import datasets
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
 from errormotion.errors import DatasetError, MethodError
 from errormotion.kinematics.beams import tilt
-from errormotion.methods.beam_direction import BeamDirection, Settings, simulation
-from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings as CalibrationSettings
-from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
+from errormotion.methods.beam_direction import BeamDirection, BeamDirectionSettings, simulation
+from errormotion.methods.beam_direction.identification.inclination.calibrate import (
+    InclinationCalibrationSettings,
+    calibrate,
+)
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.point_sensor import RECEIVER
 
@@ -36,7 +38,7 @@ def calibration(readings, tmp_path_factory):
 
 
 def identify(raw, calibration, **settings):
-    return BeamDirection().identify(raw, Settings(compensation=calibration, **settings))
+    return BeamDirection().identify(raw, BeamDirectionSettings(compensation=calibration, **settings))
 
 
 def reversed_normal(raw):
@@ -112,15 +114,18 @@ def test_compensation_without_the_side_of_the_receiver_is_refused_by_name(machin
     assert in_uncertainties(stated, machine) < 4
     layout = {"triangulation_normal": (0.0, 1.0, 0.0)}
     method = BeamDirection()
-    assert method.check(Settings(compensation=calibration, receiver="left", layout=layout)) == {}
-    assert set(method.check(Settings(compensation=calibration))) == {"receiver", "layout.triangulation_normal"}
+    assert method.check(BeamDirectionSettings(compensation=calibration, receiver="left", layout=layout)) == {}
+    assert set(method.check(BeamDirectionSettings(compensation=calibration))) == {
+        "receiver",
+        "layout.triangulation_normal",
+    }
 
 
 def test_rotations_of_a_calibration_without_their_zero_are_refused_by_name(readings):
     with pytest.raises(MethodError, match=r"^receiver_rotation: expected the rotation.*towards the receiver"):
         calibrate(readings.drop_vars("receiver_rotation"))
     with pytest.raises(MethodError, match=r"receiver_rotation: expected 0 or 180 deg.*found 90 deg"):
-        calibrate(readings, CalibrationSettings(receiver_rotation=np.pi / 2))
+        calibrate(readings, InclinationCalibrationSettings(receiver_rotation=np.pi / 2))
 
 
 def test_rotations_may_be_counted_from_either_side(readings, calibration, tmp_path):

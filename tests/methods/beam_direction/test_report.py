@@ -14,7 +14,7 @@ from errormotion.methods.beam_direction import simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import calibrate
 from errormotion.methods.beam_direction.method import BeamDirection
 from errormotion.methods.beam_direction.report import surface
-from errormotion.methods.beam_direction.settings import Settings
+from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.report import write_report
 from errormotion.twin import VirtualMachine
 
@@ -459,7 +459,9 @@ def measured():
 
 @pytest.mark.usefixtures("unprinted")
 def test_a_result_of_the_method_is_reported_completely(page, measured):
-    errors = BeamDirection().identify(measured, Settings(compensation="lk-h050", extrapolate=True, ordered=False))
+    errors = BeamDirection().identify(
+        measured, BeamDirectionSettings(compensation="lk-h050", extrapolate=True, ordered=False)
+    )
     html = page(errors, raw=measured)
     text = words_of(html)
     assert "SIMULATED DATA" in text
@@ -478,7 +480,7 @@ def test_a_result_of_the_method_is_reported_completely(page, measured):
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_result_without_compensation_is_reported_with_contradicting_planes(page, measured):
-    html = page(BeamDirection().identify(measured, Settings(ordered=False)), raw=measured)
+    html = page(BeamDirection().identify(measured, BeamDirectionSettings(ordered=False)), raw=measured)
     assert "The readings were not compensated for the tilt of the planes" in words_of(html)
     assert "The planes contradict one another" in words_of(html)
     assert "the triangulation plane is unknown" in words_of(html)

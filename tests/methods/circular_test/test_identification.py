@@ -8,10 +8,10 @@ from errormotion import plugins
 from errormotion.campaign.files import load_campaign
 from errormotion.errors import MethodError, PluginWarning
 from errormotion.measurement.drawing import simulate
-from errormotion.methods.circular_test import CircularTest, Settings, figures, path
+from errormotion.methods.circular_test import CircularTest, CircularTestSettings, figures, path
 from errormotion.methods.circular_test.path import PARAMETERS, TYPICAL
 
-SMALL = Settings(samples=540, places=60)
+SMALL = CircularTestSettings(samples=540, places=60)
 SEEDS = 150
 FALSE_ALARM = 1e-3
 R, V = 0.15, 1 / 60
@@ -62,7 +62,7 @@ ONE_ERROR = {
 def test_each_error_is_found_and_makes_the_deviation_of_its_formula(name):
     """G and H of one error agree with its formula within 1 %, for the average of a sector and the second order."""
     size, g, h = ONE_ERROR[name]
-    settings = Settings(length_noise=1e-12, length_uncertainty=0.0)
+    settings = CircularTestSettings(length_noise=1e-12, length_uncertainty=0.0)
     errors = CircularTest().identify(path.expected(settings, {name: size}), settings)
     found = dict(zip(PARAMETERS, errors["parameters"].values, strict=True))
     assert found.pop(name) == pytest.approx(size, rel=1e-3)
@@ -117,7 +117,7 @@ def test_intervals_of_the_figures_hold_the_truth(ratios):
 @pytest.mark.parametrize("decay", [1.0, 3.0])
 def test_a_spike_is_not_reduced_by_the_width_of_a_sector(decay):
     """G, H and F of the path itself: the mean over 2 degrees of a spike of 3 degrees is a quarter smaller."""
-    settings = Settings()
+    settings = CircularTestSettings()
     machine = Machine(spike_1=6e-6, spike_2=4e-6, backlash_1=1e-6, backlash_2=1e-6)
     narrow = settings.model_copy(update={"spike_decay": np.radians(decay)})
     true, held, seeds = figures.evaluate(machine.path(narrow)), np.zeros(7), 40
@@ -155,7 +155,7 @@ def test_the_plan_is_at_the_bound_of_cramer_and_rao():
 
     The bound is that of all readings for the parameters in addition to radius, offset and drift.
     """
-    settings = Settings()
+    settings = CircularTestSettings()
     raw, planned = path.expected(settings), CircularTest().plan(settings)
     angle = raw["angle"].values.ravel()
     sense = np.repeat([1.0, -1.0], angle.size // 2)

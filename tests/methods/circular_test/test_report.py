@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.circular_test import CircularTest, Settings
+from errormotion.methods.circular_test import CircularTest, CircularTestSettings
 from errormotion.report import write_report
 from errormotion.report.text import rounded
 
@@ -19,7 +19,7 @@ TURN = 2 * np.pi
 @pytest.fixture(scope="module")
 def measured():
     """Return the result of a test in which something is missing, with limits, noisy, and set up badly."""
-    settings = Settings(samples=540, places=60, circular_deviation_limit=5e-6, hysteresis_limit=10e-6)
+    settings = CircularTestSettings(samples=540, places=60, circular_deviation_limit=5e-6, hysteresis_limit=10e-6)
     raw, _ = CircularTest().simulate(settings, seed=1)
     raw["length_noise"] = raw["length_noise"].copy(data=0.05e-6)
     raw["length"] = raw["length"].where((raw["angle"] % TURN < TURN / 6) | (raw["angle"] % TURN > TURN * 11 / 60))

@@ -24,14 +24,14 @@ from errormotion.methods.crossbeam_scan.acquisition import moving
 from errormotion.methods.crossbeam_scan.acquisition.scans import CHUNK_LINES, expected_lines, record_scans
 from errormotion.methods.crossbeam_scan.acquisition.schedule import schedule
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans, interruptions
-from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings, PoseSettings
 from errormotion.plugins.readings import Profiles
 
 PITCH = 70e-6
 TRAVEL = {"X": (0.0, 1.0), "Y": (-1.0, 3.0), "Z": (0.0, 1.0)}
 POINTS = 4
 LEAD_IN = 1.7
-SETTINGS = Settings(
+SETTINGS = CrossbeamScanSettings(
     positions=(0.3, 0.45), warm_up=(420.0, 900.0, 1800.0), cold_repeats=1, profiler_pose=PoseSettings(dz=-0.17)
 )
 
@@ -449,7 +449,7 @@ def test_end_of_the_acquisition_between_two_chunks_stops_the_stream():
 # ---------------------------------------------------------------------- the virtual gantry
 
 PLACES = (-0.3, 0.1)
-ON_GANTRY = Settings(
+ON_GANTRY = CrossbeamScanSettings(
     positions=PLACES, warm_up=(420.0, 1800.0), cold_repeats=0, profiler_pose=PoseSettings(), travel=(-0.9, 0.9)
 )
 

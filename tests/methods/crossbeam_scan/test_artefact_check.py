@@ -14,7 +14,7 @@ from errormotion.methods.crossbeam_scan.identification.artefacts import MOVED, c
 from errormotion.methods.crossbeam_scan.identification.model import Campaign
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Profiler
 
@@ -65,7 +65,7 @@ EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansio
 
 
 def identify(raw, **settings):
-    return CrossbeamScan().identify(raw, Settings(**EXACT, **settings))
+    return CrossbeamScan().identify(raw, CrossbeamScanSettings(**EXACT, **settings))
 
 
 def named(ds, what="moved before"):
@@ -170,7 +170,7 @@ def judged(seed, step=None):
     crossbeam, rng = VirtualMachine("gantry", seed=seed).crossbeam, np.random.default_rng(seed)
     pose = RigidTransform.from_matrix(crossbeam.pose)
     W, A = chain.from_maps(pose)[:6, :6], chain.carriage_adjoint(pose, crossbeam.lever)
-    C, effect = registration_covariance(Settings())
+    C, effect = registration_covariance(CrossbeamScanSettings())
     strains = 20e-6 * np.ones(4)
     shape = len(TIMES), len(PLACES)
     cold, own = rng.multivariate_normal(np.zeros(9), C / 2, (2, *shape))
@@ -190,7 +190,7 @@ def judged(seed, step=None):
         cold_share=np.broadcast_to(0.5 * warm, shape),
     )
     every = Campaign(found, PLACES, chain.Rig(pose, crossbeam.lever), None, strains, 0.0)
-    return check_artefacts(every, Settings(), TIMES[2:], [0, 1], [2, 3, 4, 5])
+    return check_artefacts(every, CrossbeamScanSettings(), TIMES[2:], [0, 1], [2, 3, 4, 5])
 
 
 def test_campaigns_without_motion_report_no_artefact():

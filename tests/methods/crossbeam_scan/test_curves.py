@@ -10,7 +10,7 @@ from errormotion.methods.crossbeam_scan.identification.chain import Rig
 from errormotion.methods.crossbeam_scan.identification.curves import MOMENTS, curves
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 
 PLACES = np.linspace(-0.7, 0.7, 8)
@@ -27,7 +27,7 @@ def campaign(seed, places=PLACES):
     crossbeam, rng = VirtualMachine("gantry", seed=seed).crossbeam, np.random.default_rng(seed)
     pose = RigidTransform.from_matrix(crossbeam.pose)
     W, A = chain.from_maps(pose)[:6], chain.carriage_adjoint(pose, crossbeam.lever)
-    C = W @ registration_covariance(Settings(**EXACT))[0] @ W.T
+    C = W @ registration_covariance(CrossbeamScanSettings(**EXACT))[0] @ W.T
     shape = len(TIMES), len(places)
     cold, own = rng.multivariate_normal(np.zeros(6), C, (2, *shape))
     twist = crossbeam.twist(TIMES[:, None], places) @ np.linalg.inv(A).T

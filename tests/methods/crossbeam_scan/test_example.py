@@ -9,7 +9,7 @@ from errormotion import datasets
 from errormotion.campaign import runner
 from errormotion.campaign.files import load_campaign
 from errormotion.methods.crossbeam_scan import CrossbeamScan
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "virtual_gantry"
@@ -76,5 +76,5 @@ def test_what_was_measured_can_be_identified_again(runs):
     ds = errors_of(runs["scan"])
     raw = datasets.load(Path(runs["scan"].path) / "raw.zarr")
     assert "record" in raw
-    again = CrossbeamScan().identify(raw, Settings(strain="guided", guide_uncertainty=1e-6))
+    again = CrossbeamScan().identify(raw, CrossbeamScanSettings(strain="guided", guide_uncertainty=1e-6))
     np.testing.assert_array_equal(again.em.twist().values, ds.em.twist().values)

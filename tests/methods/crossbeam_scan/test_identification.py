@@ -16,7 +16,7 @@ from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registration import blocks, kernels
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.montecarlo.trials import redrawing_of, sample
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
@@ -53,7 +53,7 @@ EXACT = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansio
 
 
 def identify(raw, **settings):
-    return CrossbeamScan().identify(raw, Settings(**EXACT, **settings))
+    return CrossbeamScan().identify(raw, CrossbeamScanSettings(**EXACT, **settings))
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_a_guide_makes_pitch_certain(found):
 
 @pytest.mark.parametrize("strain", ["free", "guided"])
 def test_trials_have_the_stated_uncertainty(strain, campaigns, found, remembering):
-    settings, errors = Settings(strain=strain, **EXACT), found[strain][0]
+    settings, errors = CrossbeamScanSettings(strain=strain, **EXACT), found[strain][0]
     with remembering():
         drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
     trials, reasons = sample(CrossbeamScan(), drawn, np.random.SeedSequence(1), range(60), (9, 6), list(drawn.sources))
@@ -401,7 +401,7 @@ def test_scales_of_the_profiler_are_in_the_uncertainty_without_being_stated():
         options = {"profiler": Profiler(1600, 25e-6), "profiles": 800, "motion": "rigid"}
         scans = simulation.raw_scans(machine, [0.0, 3600.0], PLACES, seed=seed, **options)
         raw = stretched(scans, np.random.default_rng(seed))
-        ds = CrossbeamScan().identify(raw, Settings(strain="rigid"))
+        ds = CrossbeamScan().identify(raw, CrossbeamScanSettings(strain="rigid"))
         assert [note for note in ds.attrs["notes"] if "assumed to be 20 um/m" in note and "scale_uncertainty" in note]
         share.append(miss(ds, machine) / stated(ds))
         exact.append(miss(ds, machine) / stated(identify(raw, strain="rigid")))
@@ -413,6 +413,8 @@ def test_scales_of_the_profiler_are_in_the_uncertainty_without_being_stated():
 
 def test_exact_scales_are_not_noted(thin, thin_by_maps):
     assert "um/m" not in " ".join(thin_by_maps.attrs["notes"])
-    stated = CrossbeamScan().identify(thin[1], Settings(scale_uncertainty=1e-5, strain="rigid")).attrs["notes"]
+    stated = (
+        CrossbeamScan().identify(thin[1], CrossbeamScanSettings(scale_uncertainty=1e-5, strain="rigid")).attrs["notes"]
+    )
     assert [note for note in stated if note.endswith(": expansion_uncertainty, mount_expansion_uncertainty.")]
     assert [note for note in stated if "50 mm: the height of the artefacts (artefact_height)" in note]

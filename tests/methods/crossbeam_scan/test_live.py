@@ -6,11 +6,11 @@ import xarray as xr
 
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.acquisition.live import QUEUE_LENGTH, LiveScans
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
 POSITIONS = (0.1, 0.3)
-SETTINGS = Settings(positions=POSITIONS, warm_up=(7200.0,), cold_repeats=0, scan_length=400 * 70e-6)
+SETTINGS = CrossbeamScanSettings(positions=POSITIONS, warm_up=(7200.0,), cold_repeats=0, scan_length=400 * 70e-6)
 
 
 @pytest.fixture(scope="module")
@@ -95,4 +95,4 @@ def test_mark_is_not_taken_for_a_scan(scans):
 
 def test_progress_of_a_pocket_states_the_lift(gantry):
     raw = simulation.raw_pocket(gantry, seed=1, profiles=20)
-    assert LiveScans(Settings(procedure="profiler_pose")).update(raw) == "pocket, scan at a lift of 182 mm"
+    assert LiveScans(CrossbeamScanSettings(procedure="profiler_pose")).update(raw) == "pocket, scan at a lift of 182 mm"

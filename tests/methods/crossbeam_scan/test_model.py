@@ -16,12 +16,12 @@ from errormotion.methods.crossbeam_scan.identification.model import Campaign, sl
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registrations import Registrations
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 TIMES = np.array([0.0, 1800.0, 7200.0])
 PLACES = np.array([-0.6, -0.2, 0.2, 0.6])
 #: one registration with line jitter, of an artefact as a plan assumes it, and its errors by strains
-COVARIANCE, EFFECT = registration_covariance(Settings())
+COVARIANCE, EFFECT = registration_covariance(CrossbeamScanSettings())
 POSE_COVARIANCE = np.diag([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5]) ** 2
 LEVER_UNCERTAINTY = np.full(3, 1e-3)
 SHARE = 0.5

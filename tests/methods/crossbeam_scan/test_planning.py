@@ -13,7 +13,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.planning import registration_covariance
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import freeform
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
@@ -31,7 +31,7 @@ def _quiet(caplog):
 
 
 def plan(**settings):
-    return CrossbeamScan().plan(Settings(**settings))
+    return CrossbeamScan().plan(CrossbeamScanSettings(**settings))
 
 
 def uncertainty(ds):
@@ -41,7 +41,7 @@ def uncertainty(ds):
 
 def waves(x, y):
     """The artefact that a plan assumes."""
-    layout = Settings().layout
+    layout = CrossbeamScanSettings().layout
     kx, ky = (2 * np.pi / wave for wave in layout.wavelength)
     return layout.relief * (np.sin(kx * x + 0.4) + np.cos(ky * y - 0.7))
 
@@ -79,7 +79,7 @@ def test_plan_agrees_with_the_stated_uncertainty_of_the_identification(machine, 
         [0.0, 7200.0], [0.0], seed=1, profiles=400, feed=70e-6, motion=motion,
         profiler=Profiler(800, 25e-6, disturbances=wrong), artefact=freeform(waves),
     )  # fmt: skip
-    stated = uncertainty(CrossbeamScan().identify(raw, Settings(strain=strain, **EXACT)))[1, 0]
+    stated = uncertainty(CrossbeamScan().identify(raw, CrossbeamScanSettings(strain=strain, **EXACT)))[1, 0]
     layout = LAYOUT | {"jitter_z": wrong.jitter_z, "jitter_y": wrong.jitter_y}
     planned = plan(
         strain=strain, positions=(0.0,), warm_up=(7200.0,), scan_length=28e-3, height_noise=wrong.noise,
@@ -133,7 +133,7 @@ def test_guide_reduces_the_expected_uncertainty():
     ids=str,
 )
 def test_better_layout_reduces_the_expected_uncertainty(better):
-    usual, good = (registration_covariance(Settings(**changes))[0] for changes in ({}, better))
+    usual, good = (registration_covariance(CrossbeamScanSettings(**changes))[0] for changes in ({}, better))
     # in no direction worse, in some better
     known = np.diag(good)[:6] > 0
     values = np.linalg.eigvalsh((usual - good)[:6, :6][np.ix_(known, known)] * 1e12)
@@ -144,7 +144,9 @@ def test_better_layout_reduces_the_expected_uncertainty(better):
 def test_twice_the_noise_is_twice_the_uncertainty():
     still = {"jitter_z": 0.0, "jitter_y": 0.0}
     once, twice = (
-        registration_covariance(Settings(layout=still, height_noise=u, scale_uncertainty=0, expansion_uncertainty=0))[0]
+        registration_covariance(
+            CrossbeamScanSettings(layout=still, height_noise=u, scale_uncertainty=0, expansion_uncertainty=0)
+        )[0]
         for u in (0.5e-6, 1e-6)
     )
     assert twice == pytest.approx(4 * once, rel=1e-6)

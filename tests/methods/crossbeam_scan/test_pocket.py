@@ -16,9 +16,9 @@ from errormotion.instruments.line_profiler.profile_files import ProfileFiles
 from errormotion.instruments.simulators import world
 from errormotion.methods.crossbeam_scan.acquisition.pocket import record_pocket
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.calibration import calibrate_dataset, parameters
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
-SETTINGS = Settings(procedure="profiler_pose", pocket_position=0.1, travel=(-0.9, 0.9))
+SETTINGS = CrossbeamScanSettings(procedure="profiler_pose", pocket_position=0.1, travel=(-0.9, 0.9))
 
 
 class Bench:

@@ -10,12 +10,12 @@ from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import stated_covariance, stated_pose
-from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings, PoseSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Profiler
 
 NOMINAL = RigidTransform.from_translation([0.0, 0.0, -0.17])
-SETTINGS = Settings(profiler_pose=PoseSettings(dz=-0.17))
+SETTINGS = CrossbeamScanSettings(profiler_pose=PoseSettings(dz=-0.17))
 SEEDS = range(8)
 
 
@@ -83,7 +83,7 @@ def test_covariance_is_that_of_small_changes_of_the_parameters(found):
 
 
 def test_default_nominal_pose_has_no_angles_and_rounded_position(raws):
-    ds = identify(raws[0][1], Settings())
+    ds = identify(raws[0][1], CrossbeamScanSettings())
     assert ds["nominal_pose"].values[:3, :3] == pytest.approx(np.eye(3))
     place = ds["nominal_pose"].values[:3, 3] / 0.01
     assert place == pytest.approx(np.round(place), abs=1e-9)

@@ -9,10 +9,10 @@ from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass, warm_up_piece
 from errormotion.methods.crossbeam_scan.acquisition.schedule import program_texts
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (-1.0, 3.0), "Z": (0.0, 1.0)}
-SETTINGS = Settings(positions=(0.35, 0.55), warm_up=(420.0, 900.0))
+SETTINGS = CrossbeamScanSettings(positions=(0.35, 0.55), warm_up=(420.0, 900.0))
 
 
 def path_of(text, start=0.317):
@@ -70,7 +70,7 @@ def test_a_program_that_leaves_the_travel_is_refused_with_its_name_and_both_ends
 
 
 def test_pocket_programs_lift_the_spindle_first():
-    pocket = Settings(procedure="profiler_pose", pocket_position=0.1, pocket_z=0.2)
+    pocket = CrossbeamScanSettings(procedure="profiler_pose", pocket_position=0.1, pocket_z=0.2)
     found = program_texts(pocket)
     assert list(found) == ["pocket_1.nc", "pocket_2.nc"]
     for text, lift in zip(found.values(), pocket.pocket_lifts, strict=True):
@@ -87,6 +87,6 @@ def test_a_pass_goes_to_the_height_of_the_scans_where_that_is_given():
 
 
 def test_no_position_is_written_as_minus_zero():
-    text = measuring_pass(Settings(positions=(0.033 - 1e-8, 0.2), warm_up=())).text()
+    text = measuring_pass(CrossbeamScanSettings(positions=(0.033 - 1e-8, 0.2), warm_up=())).text()
     assert "Y0.000" in text
     assert "Y-0.000" not in text

@@ -7,7 +7,7 @@ from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
 from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, _of_strains, register_all
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin.sensors.profiler import Profiler
 
 
@@ -22,7 +22,7 @@ def test_bending_of_a_block_is_that_of_its_parabola():
 def test_points_too_far_apart_for_the_relief_are_reported(gantry, pitch, notes):
     profiler = Profiler(400, pitch)
     raw = simulation.raw_scans(gantry, [0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
-    found = register_all(Scans(raw), [0], 0.5e-6, Settings())
+    found = register_all(Scans(raw), [0], 0.5e-6, CrossbeamScanSettings())
     assert len(found.notes) == notes
     assert all("Reduce the pitch of points and lines" in note for note in found.notes)
 

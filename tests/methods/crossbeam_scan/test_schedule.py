@@ -9,7 +9,7 @@ from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.crossbeam_scan.acquisition.programs import measuring_pass
 from errormotion.methods.crossbeam_scan.acquisition.schedule import PROGRAM_INTERVAL, schedule
-from errormotion.methods.crossbeam_scan.settings import MINUTE, Settings
+from errormotion.methods.crossbeam_scan.settings import MINUTE, CrossbeamScanSettings
 
 TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}
 
@@ -17,7 +17,7 @@ TRAVEL = {"X": (0.0, 1.0), "Y": (0.0, 3.0), "Z": (0.0, 1.0)}
 @pytest.fixture
 def settings():
     """Eight artefacts, warm-up times as published."""
-    return Settings(positions=tuple(0.35 + 0.2 * k for k in range(8)))
+    return CrossbeamScanSettings(positions=tuple(0.35 + 0.2 * k for k in range(8)))
 
 
 def test_every_pass_starts_at_its_warm_up_time_with_moves_between(settings):
@@ -65,7 +65,7 @@ def test_warm_up_times_without_time_for_a_pass_between_them_are_refused(settings
 
 def test_campaign_without_artefacts_states_what_is_missing():
     with pytest.raises(MethodError, match="set 'positions'"):
-        schedule(Settings())
+        schedule(CrossbeamScanSettings())
 
 
 def test_a_campaign_may_be_cold_passes_only(settings):

@@ -7,7 +7,7 @@ from errormotion.datasets import validate
 from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.artefacts.pieces import swept
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
@@ -138,10 +138,11 @@ def test_strained_scans_have_the_effect_that_the_result_states(strain, group, si
     nothing = {"scale_uncertainty": 0.0, "expansion_uncertainty": 0.0, "mount_expansion_uncertainty": 0.0}
     options = {"strain": "rigid", "artefact_height": 0.1}
     name = f"{strain}_uncertainty"
-    strained = simulation.strained(raw, Settings(**options, **nothing | {name: 100e-6}), _Ones())
+    strained = simulation.strained(raw, CrossbeamScanSettings(**options, **nothing | {name: 100e-6}), _Ones())
     # so small an uncertainty that the registration takes the strain as 0
     before, after = (
-        CrossbeamScan().identify(each, Settings(**options, **nothing | {name: 1e-9})) for each in (raw, strained)
+        CrossbeamScan().identify(each, CrossbeamScanSettings(**options, **nothing | {name: 1e-9}))
+        for each in (raw, strained)
     )
     F = before["influence"].transpose("source", "time", "position", "dof").values[:, 1, 0]
     change = (after.em.twist().values - before.em.twist().values)[1, 0]

@@ -9,7 +9,7 @@ import pytest
 from errormotion.errors import DatasetError, MethodError
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.cutting import interruption
-from errormotion.methods.crossbeam_scan.settings import Settings
+from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin.artefacts.pieces import freeform, plane
 from errormotion.twin.sensors.profiler import Profiler
 
@@ -58,7 +58,7 @@ def _quiet(caplog):
 
 
 def identify(raw, **settings):
-    return CrossbeamScan().identify(raw, Settings(**settings))
+    return CrossbeamScan().identify(raw, CrossbeamScanSettings(**settings))
 
 
 def spoil(raw, heights, cycle=CYCLE, artefact=ARTEFACT):

@@ -4,7 +4,7 @@ import pytest
 import xarray as xr
 
 from errormotion.kinematics.iso import iso_names
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 
 EXACT = {"uncertainty": {"length": 0.0, "alignment": 0.0}}
 """An instrument without uncertainty: nothing is corrected."""
@@ -33,6 +33,6 @@ def identify():
     """Return a function that identifies raw data, by default of an instrument without uncertainty."""
 
     def run(raw, **settings):
-        return LinearPositioning().identify(raw, Settings(**{**EXACT, "trials": 200, **settings}))
+        return LinearPositioning().identify(raw, LinearPositioningSettings(**{**EXACT, "trials": 200, **settings}))
 
     return run

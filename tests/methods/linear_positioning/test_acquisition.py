@@ -7,7 +7,7 @@ from axis_doubles import BACKLASH, PITCH, Bench, Interferometer, Machine, Thermo
 
 from errormotion import datasets
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.acquisition.measure import measure_axis
 from errormotion.methods.linear_positioning.settings import Budget
 
@@ -24,7 +24,7 @@ def measured(settings, done=None, **kinds):
     return raw
 
 
-TWO = Settings(**TEST, freedoms=("EX", "EB"), channels={"EX": "-length", "EB": "pitch"})
+TWO = LinearPositioningSettings(**TEST, freedoms=("EX", "EB"), channels={"EX": "-length", "EB": "pitch"})
 
 
 @pytest.mark.parametrize("cycle", ["linear", "pendulum"])
@@ -43,7 +43,7 @@ def test_an_interferometer_finds_the_errors_of_the_axis(cycle):
 
 def test_a_tracker_in_line_finds_the_errors_of_the_axis():
     machine = Machine()
-    settings = Settings(**TEST, uncertainty=EXACT)
+    settings = LinearPositioningSettings(**TEST, uncertainty=EXACT)
     raw = measured(settings, controller=machine, laser_tracker=Tracker(machine))
     errors = LinearPositioning().identify(raw, settings)
     P = errors["x"].values
@@ -65,7 +65,7 @@ def test_readings_are_missing_from_a_broken_beam_to_the_end_of_its_run():
 def test_a_new_dead_path_of_a_tracker_is_a_broken_beam():
     machine = Machine()
     tracker = Tracker(machine, renewed=[30])
-    raw = measured(Settings(**TEST), controller=machine, laser_tracker=tracker)
+    raw = measured(LinearPositioningSettings(**TEST), controller=machine, laser_tracker=tracker)
     missing = np.isnan(raw["deviation"].values[0])
     assert missing[1].any()
     assert not missing[[0, 2, 3]].any()

@@ -12,7 +12,7 @@ from errormotion.errors import DatasetError, MethodError
 from errormotion.instruments import simulators
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.interferometer.attocube_ids import AttocubeIds
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.diagonals import lines as geometry
 from errormotion.methods.linear_positioning.report import chapters
 from errormotion.report.document import Source
@@ -24,7 +24,9 @@ BODIES = ("PPP", "NPP", "PNP", "NNP")
 
 
 def along(names, **settings):
-    return Settings(**{"diagonals": {"names": names}, "count": 5, "runs": 4, "trials": 200, **settings})
+    return LinearPositioningSettings(
+        **{"diagonals": {"names": names}, "count": 5, "runs": 4, "trials": 200, **settings}
+    )
 
 
 def exact(machine, settings):
@@ -151,7 +153,7 @@ def test_stops_lie_on_the_diagonal_and_programs_stop_for_the_instrument():
 )
 def test_settings_without_valid_diagonals_are_refused(wrong, text):
     with pytest.raises(ValueError, match=text):
-        Settings(diagonals=wrong)
+        LinearPositioningSettings(diagonals=wrong)
 
 
 def test_positions_off_a_line_are_refused():

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from errormotion.measurement.identification import solve
-from errormotion.methods.linear_positioning import Settings
+from errormotion.methods.linear_positioning import LinearPositioningSettings
 from errormotion.methods.linear_positioning.identification import extremes, standard
 from errormotion.methods.linear_positioning.identification.identify import evaluate, observe, statistics_of
 from errormotion.methods.linear_positioning.identification.scatter import scatter
@@ -15,7 +15,7 @@ from errormotion.methods.linear_positioning.identification.standard import FIGUR
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
 SEEDS = 60
-SETTINGS = Settings(trials=300)
+SETTINGS = LinearPositioningSettings(trials=300)
 BEHAVIOURS = {"usual": Behaviour(), "drifting": Behaviour(noise=0.2e-6, offset=1e-6, slope=1e-6, opposite=0.5e-6)}
 
 

@@ -6,7 +6,7 @@ from scipy import stats
 
 from errormotion.datasets.results.merit import figures_of
 from errormotion.errors import ErrormotionError
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 
 METHOD = LinearPositioning()
 STATED = {"scatter": 0.3e-6, "drift": 0.5e-6}
@@ -55,7 +55,7 @@ CASES |= {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize(("runs", "stated"), [(1, STATED), (2, {"drift": 0.5e-6}), (5, {})], ids=["1", "2", "5"])
 def test_missing_readings_give_a_result_or_a_refusal(case, runs, stated):
-    settings = Settings(runs=runs, uncertainty=stated, trials=200)
+    settings = LinearPositioningSettings(runs=runs, uncertainty=stated, trials=200)
     raw, _ = METHOD.simulate(settings, 1)
     raw = raw.copy(deep=True)
     CASES[case](raw["deviation"].values)
@@ -70,7 +70,7 @@ def test_missing_readings_give_a_result_or_a_refusal(case, runs, stated):
 
 
 def test_a_single_reading_of_one_approach_is_a_result():
-    settings = Settings(trials=200)
+    settings = LinearPositioningSettings(trials=200)
     raw, _ = METHOD.simulate(settings, 1)
     raw = raw.copy(deep=True)
     single_backward(raw["deviation"].values)
@@ -83,7 +83,7 @@ def test_a_single_reading_of_one_approach_is_a_result():
 
 @pytest.mark.slow
 def test_figures_contain_the_truth_where_targets_were_reached_by_one_approach_only():
-    settings = Settings(trials=400)
+    settings = LinearPositioningSettings(trials=400)
     seeds, held = 200, 0
     for seed in range(seeds):
         raw, truth = METHOD.simulate(settings, seed)

@@ -9,14 +9,14 @@ from scipy import stats
 from errormotion import datasets
 from errormotion.datasets.results.merit import figures_of
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.acquisition.warming import measure_moving
 from errormotion.methods.linear_positioning.report import chapters
 from errormotion.methods.linear_positioning.settings import Moving
 from errormotion.report.document import Source
 
 METHOD = LinearPositioning()
-SETTINGS = Settings(moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
+SETTINGS = LinearPositioningSettings(moving=Moving(cold=5, duration=7200.0, cooling=1800.0, interval=120.0))
 GROWTH_OF_A_METRE = 1e-6
 """Relative expansion of the screw for each metre of fast motion."""
 
@@ -118,7 +118,7 @@ def test_figures_and_report_contain_both_ends():
 
 
 def test_the_expansion_of_a_screw_is_measured_within_the_stroke():
-    settings = Settings(
+    settings = LinearPositioningSettings(
         travel=(0.0, 0.4),
         dwell=0.5,
         settle=0.2,

@@ -8,7 +8,7 @@ from scipy import stats
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.description import MachineDescription
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.planning import motions, targets
 from errormotion.methods.linear_positioning.simulation import Behaviour, raw_and_truth
 
@@ -22,7 +22,7 @@ def test_as_many_targets_as_the_standard_requires(length, count):
 
 def test_targets_have_a_random_part_and_stay_within_the_travel():
     for seed in range(50):
-        settings = Settings(travel=(0.1, 0.6), seed=seed)
+        settings = LinearPositioningSettings(travel=(0.1, 0.6), seed=seed)
         P = targets.positions(settings)
         assert P[0] >= 0.1
         assert P[-1] <= 0.6
@@ -34,7 +34,7 @@ def test_targets_have_a_random_part_and_stay_within_the_travel():
 
 @pytest.mark.parametrize("cycle", ["linear", "pendulum"])
 def test_every_target_is_approached_over_the_overrun(cycle):
-    settings = Settings(cycle=cycle, runs=3, count=5, targets=())
+    settings = LinearPositioningSettings(cycle=cycle, runs=3, count=5, targets=())
     P, visits, position = targets.positions(settings), [], None
     for approach in targets.sequence(settings):
         position = approach.before if approach.before is not None else position
@@ -48,7 +48,7 @@ def test_every_target_is_approached_over_the_overrun(cycle):
 
 
 def test_motions_are_those_of_the_program_within_the_limits():
-    settings = Settings(axis="Y", travel=(0.0, 0.4), limits=(-0.01, 0.41), start=(0.1, 0.0, 0.2))
+    settings = LinearPositioningSettings(axis="Y", travel=(0.0, 0.4), limits=(-0.01, 0.41), start=(0.1, 0.0, 0.2))
     steps = METHOD.motions(settings)
     places = [step.place for step in steps if step.place is not None]
     assert {place[0] for place in places} == {0.1}
@@ -63,25 +63,25 @@ def test_motions_are_those_of_the_program_within_the_limits():
 
 
 def test_a_test_beyond_the_limits_is_refused():
-    settings = Settings(travel=(0.0, 0.4), limits=(0.0, 0.4), overrun=0.1)
+    settings = LinearPositioningSettings(travel=(0.0, 0.4), limits=(0.0, 0.4), overrun=0.1)
     with pytest.raises(MethodError, match=r"expected X from 0\.000 to 400\.000 mm; .*, with an overrun of 100 mm"):
         motions.steps(settings)
     machine = MachineDescription("C-frame", "workpiece-X-Y-bed-Z-spindle-tool", dict.fromkeys("XYZ", (0.0, 0.3)))
     assert "travel" in METHOD.check_machine(settings, machine)
-    assert METHOD.check_machine(Settings(travel=(0.1, 0.2)), machine) == {}
+    assert METHOD.check_machine(LinearPositioningSettings(travel=(0.1, 0.2)), machine) == {}
 
 
 def test_the_plan_states_the_uncertainty_of_a_simulated_test():
     """With the scatter and drift assumed by the plan, the mean stated uncertainty is that of the plan."""
     stated = {"scatter": 0.5e-6, "drift": np.sqrt(12.0) * 0.6e-6}
-    settings = Settings(runs=12, trials=200, uncertainty=stated)
+    settings = LinearPositioningSettings(runs=12, trials=200, uncertainty=stated)
     plan = METHOD.plan(settings)
     groups = ["drift from run to run", "independent"]
     planned = plan.em.budget().sel(group=groups, dof="EX").isel(position=5).values
     # half of the variance of a run of one approach is common to both
     assert planned == pytest.approx([0.6e-6 / np.sqrt(24), 0.5e-6 / np.sqrt(24)])
     behaviour = Behaviour(0.5e-6, 0.6e-6 / np.sqrt(2.0), 0.0, 0.6e-6 / np.sqrt(2.0))
-    free, measured = Settings(runs=12, trials=200), []
+    free, measured = LinearPositioningSettings(runs=12, trials=200), []
     for seed in range(20):
         errors = METHOD.identify(raw_and_truth(free, seed, behaviour)[0], free)
         measured.append(errors.em.budget().sel(group=groups, dof="EX").isel(position=5).values ** 2)
@@ -92,4 +92,4 @@ def test_the_plan_states_the_uncertainty_of_a_simulated_test():
 
 def test_duplicate_targets_are_refused():
     with pytest.raises(ValueError, match="three or more different positions"):
-        Settings(targets=(0.1, 0.1, 0.2))
+        LinearPositioningSettings(targets=(0.1, 0.1, 0.2))

@@ -6,13 +6,13 @@ import xarray as xr
 
 from errormotion.errors import DatasetError
 from errormotion.methods.linear_positioning import LinearPositioning
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.decision import OPEN
 from errormotion.tolerances.table import Tolerances
 
 METHOD = LinearPositioning()
-SETTINGS = Settings(freedoms=("EX",), runs=5, count=11, trials=200)
+SETTINGS = LinearPositioningSettings(freedoms=("EX",), runs=5, count=11, trials=200)
 DRIFT = 5e-6
 """From the first to the last run, m."""
 

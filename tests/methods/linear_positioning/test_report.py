@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.report import chapters
 from errormotion.report.document import Figure, Source, Table
 
-SETTINGS = Settings(freedoms=("EY", "EX", "EB"), trials=200, accuracy_limit=1e-3, repeatability_limit=1e-9)
+SETTINGS = LinearPositioningSettings(
+    freedoms=("EY", "EX", "EB"), trials=200, accuracy_limit=1e-3, repeatability_limit=1e-9
+)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from errormotion import datasets
 from errormotion.datasets.importing import import_log
 from errormotion.errors import DatasetError
-from errormotion.methods.linear_positioning import LinearPositioning, Settings
+from errormotion.methods.linear_positioning import LinearPositioning, LinearPositioningSettings
 from errormotion.methods.linear_positioning.rtl import read_rtl
 
 MAP = 'schema = "errormotion.map.rtl/1"\naxis = "Y"\nlength_uncertainty = "0.4 um/m"\n'
@@ -69,7 +69,7 @@ def test_runs_become_approaches_with_their_positions_and_units(imported):
     np.testing.assert_allclose(raw["target_position"], np.array(TARGETS) * 1e-3)
     expected = [[[deviation(2 * run + 1 + a, t) for t in range(1, 8)] for a in range(2)] for run in range(4)]
     np.testing.assert_allclose(raw["deviation"].values[0], np.array(expected) * 1e-6, rtol=1e-12)
-    errors = LinearPositioning().identify(raw, Settings(axis="Y", trials=200))
+    errors = LinearPositioning().identify(raw, LinearPositioningSettings(axis="Y", trials=200))
     assert float(errors["B_mean"]) == pytest.approx(1.99e-6)  # 2 um less the step from run to run
 
 
@@ -105,7 +105,7 @@ def test_a_test_of_one_direction_has_no_missing_readings(imported) -> None:
     )
     assert raw["approach"].values.tolist() == ["forward"]
     assert raw.attrs["missing_values"] == "{}"
-    notes = " ".join(LinearPositioning().identify(raw, Settings(axis="Y", trials=200)).em.notes)
+    notes = " ".join(LinearPositioning().identify(raw, LinearPositioningSettings(axis="Y", trials=200)).em.notes)
     assert "missing" not in notes
     assert "approached forward only" in notes
 

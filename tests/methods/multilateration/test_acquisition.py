@@ -12,7 +12,7 @@ from errormotion.methods.multilateration.acquisition.measure import measure_stat
 from errormotion.methods.multilateration.networks import solve
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.readings import latest
-from errormotion.methods.multilateration.settings import Measuring, Settings
+from errormotion.methods.multilateration.settings import Measuring, MultilaterationSettings
 
 STATIONS = ((-0.35, -0.3, 0.0), (0.35, -0.3, 0.05), (0.35, 0.3, 0.0), (-0.3, 0.3, 0.5))
 LAYOUT = {"low": (-0.1, -0.1, 0.0), "high": (0.1, 0.1, 0.2), "count": (3, 3, 2), "stations": STATIONS}
@@ -22,7 +22,7 @@ NOISE, BULGE = 0.2e-6, 2e-3  # 1/m: the machine is wrong by up to some 0.1 mm
 
 
 def settings(**changes):
-    return Settings(layout=LAYOUT | {"reflector": REFLECTOR} | changes)
+    return MultilaterationSettings(layout=LAYOUT | {"reflector": REFLECTOR} | changes)
 
 
 def true_place(position):

@@ -6,7 +6,7 @@ from scipy import stats
 
 from errormotion import datasets
 from errormotion.errors import DatasetError, MethodError
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.methods.multilateration.axes import diagonals, grid, volumetric_errors
 from errormotion.methods.multilateration.refraction import refractive_index
 from errormotion.twin import VirtualMachine
@@ -177,7 +177,7 @@ def test_without_a_chain_there_are_no_axes(raw):
 
 
 def test_the_uncertainty_of_the_scale_is_in_the_budget(raw):
-    found = Multilateration().identify(raw, Settings(scale_uncertainty="2 um/m", air=STILL_AIR))
+    found = Multilateration().identify(raw, MultilaterationSettings(scale_uncertainty="2 um/m", air=STILL_AIR))
     budget = found.em.budget()
     assert list(budget["group"].values) == [
         "stations",
@@ -192,7 +192,7 @@ def test_the_uncertainty_of_the_scale_is_in_the_budget(raw):
 
 
 def test_assumed_uncertainties_are_noted_and_change_no_value(raw, errors):
-    exact = Multilateration().identify(raw, Settings(scale_uncertainty=0.0, air=STILL_AIR))
+    exact = Multilateration().identify(raw, MultilaterationSettings(scale_uncertainty=0.0, air=STILL_AIR))
     assert "an uncertainty of the tracker's lengths of 0.5 um/m (scale_uncertainty)" in notes(errors)
     assert "an uncertainty of the air of 0.2 K of its temperature, 50 Pa of its pressure, 5 %" in notes(errors)
     assert "Assumed" not in notes(exact)
@@ -211,7 +211,7 @@ def test_scale_errors_of_a_tracker_that_states_none_are_within_the_uncertainty(m
     for seed in range(20):
         scale = 0.5e-6 * float(np.random.default_rng(seed).normal())
         raw = simulation.raw(machine, q, seed=seed, noise=0.02e-6, scale=scale)
-        found = Multilateration().identify(raw, Settings(parametric=False))
+        found = Multilateration().identify(raw, MultilaterationSettings(parametric=False))
         held.append(np.mean((np.abs(vectors(found) - truth) < 1.96 * spread(found))[outer]))
     # 20 independent scale errors, of which 95 % are within the interval: 4 sigma of their share are 0.2.
     assert np.mean(held) > 0.75
@@ -223,11 +223,13 @@ def test_what_is_assumed_of_reflector_expansion_and_chain_is_noted(raw, errors):
     assert "reflector is at zero" not in notes(errors)
     np.testing.assert_array_equal(vectors(blank), vectors(errors))
     assert "temperature of the measurement" in notes(errors)
-    warm = Multilateration().identify(raw, Settings(expansion={"coefficient": 11.5e-6, "temperature": 23.0}))
+    warm = Multilateration().identify(
+        raw, MultilaterationSettings(expansion={"coefficient": 11.5e-6, "temperature": 23.0})
+    )
     assert "temperature of the measurement" not in notes(warm)
     assert "of the scales of 1 um/m/K (expansion.coefficient_uncertainty)" in notes(warm)
     other = "workpiece-bed-Z-Y-X-spindle-tool"
-    turned = Multilateration().identify(raw, Settings(chain=other))
+    turned = Multilateration().identify(raw, MultilaterationSettings(chain=other))
     assert f"The data state the chain {raw.attrs['chain']}; the setting {other} is used." in notes(turned)
 
 
@@ -235,7 +237,7 @@ def test_mirrored_axes_are_noted_at_every_station_and_opposite_readings_refused(
     mirror = np.array([-1.0, 1.0, 1.0])
     for name in ("target_nominal", "station_nominal"):
         mirrored = raw.assign({name: (raw[name].dims, raw[name].values * mirror, raw[name].attrs)})
-        found = notes(Multilateration().identify(mirrored, Settings(parametric=False)))
+        found = notes(Multilateration().identify(mirrored, MultilaterationSettings(parametric=False)))
         assert all(f"Station S{k} is " in found for k in (1, 2, 3, 4))
     opposite = raw.assign(displacement=(raw["displacement"].dims, -raw["displacement"].values, {"units": "m"}))
     with pytest.raises(MethodError, match="opposite sign: a displacement increases with the distance"):
@@ -261,14 +263,14 @@ def test_lengths_in_vacuum_are_converted_to_lengths_in_air(raw, errors):
 
 def test_scales_are_corrected_to_20_degrees(raw, errors):
     warm = {"coefficient": 11.5e-6, "temperature": 23.0, "coefficient_uncertainty": 1e-6}
-    found = Multilateration().identify(raw, Settings(expansion=warm))
+    found = Multilateration().identify(raw, MultilaterationSettings(expansion=warm))
     position = raw["target_nominal"].values
     shape = 3 * 11.5e-6 * (position - position.mean(axis=0))
     # Second order: errors turn the beams by 1e-5.
     np.testing.assert_allclose(vectors(found), vectors(errors) - shape, atol=2e-9)
     assert "scales" in found.em.budget()["group"].values
     with pytest.raises(MethodError, match="scale_temperature"):
-        Multilateration().identify(raw, Settings(expansion={"coefficient": "11.5 um/m/K"}))
+        Multilateration().identify(raw, MultilaterationSettings(expansion={"coefficient": "11.5 um/m/K"}))
 
 
 # ---------------------------------------------------------------- returns
@@ -286,12 +288,12 @@ def test_drift_during_the_set_ups_is_subtracted(machine):
     assert np.sqrt(np.mean(left**2)) < 2e-6
     assert "drift" in found.em.budget()["group"].values
     with pytest.raises(MethodError, match="A drifting set-up has the same effect"):
-        Multilateration().identify(raw, Settings(drift="none"))
+        Multilateration().identify(raw, MultilaterationSettings(drift="none"))
 
 
 def test_repeatability_of_the_machine_is_noise_with_separate_set_ups(machine):
     raw = simulation.raw(machine, seed=6, repeatability=2e-6)
-    stated = Multilateration().identify(raw, Settings(repeatability="2 um"))
+    stated = Multilateration().identify(raw, MultilaterationSettings(repeatability="2 um"))
     raised = Multilateration().identify(raw)
     truth = vectors(simulation.true_errors(machine, simulation.target_grid(machine)))
     for found in (stated, raised):
@@ -307,7 +309,7 @@ def _returning(machine, seed, true, returns=6, **reported):
     q = simulation.target_grid(machine, (4, 4, 3))
     q = np.concatenate([q, q[:: 48 // returns][:returns]])
     raw = simulation.raw(machine, q, seed=seed, repeatability=true)
-    left = Multilateration().identify(raw, Settings(parametric=False, **reported))
+    left = Multilateration().identify(raw, MultilaterationSettings(parametric=False, **reported))
     return left, vectors(left) - vectors(simulation.true_errors(machine, q))
 
 
@@ -368,7 +370,7 @@ def test_with_simultaneous_stations_repeatability_displaces_the_target(machine):
     way = simulation.reflector_positions(machine, q) - U[:, None]
     d = np.einsum("jta,ta->jt", way / np.linalg.norm(way, axis=2)[..., None], moved)
     raw["displacement"] = (raw["displacement"] + d).assign_attrs(units="m")
-    found = Multilateration().identify(raw, Settings(together=True, parametric=False))
+    found = Multilateration().identify(raw, MultilaterationSettings(together=True, parametric=False))
     # 12 returns, 36 coordinates: known to 12 %.
     assert float(found["repeatability"]) == pytest.approx(2e-6, rel=0.4)
     assert 0.9 < np.mean(np.abs(vectors(found) - truth) < 1.96 * spread(found)) < 0.99
@@ -450,9 +452,9 @@ def test_one_reading_in_millimetres_is_ignored_and_a_station_in_millimetres_is_r
 
 def test_a_fringe_with_four_stations_excludes_the_target_and_affects_no_other(machine):
     raw = simulation.raw(machine, seed=2, noise=20e-9)
-    sound = Multilateration().identify(raw, Settings(parametric=False))
+    sound = Multilateration().identify(raw, MultilaterationSettings(parametric=False))
     raw["displacement"][1, 41] += 633e-9 / 2
-    found = Multilateration().identify(raw, Settings(parametric=False))
+    found = Multilateration().identify(raw, MultilaterationSettings(parametric=False))
     assert np.flatnonzero(np.isnan(found["EX"].values)).tolist() == [41]
     assert "1 of 100 targets are unknown without the distances that are not used: T042" in notes(found)
     assert found["left_out"].values[:, 41].tolist() == [2, 2, 2, 2]
@@ -463,7 +465,7 @@ def test_a_permanent_loss_of_fringes_is_reported_as_a_moved_station(machine):
     raw = simulation.raw(machine, seed=2, station=_five(machine), noise=20e-9)
     raw["displacement"][1, 41:] += 633e-9 / 2
     with pytest.raises(MethodError, match=r"station S2 was moved by about [\d.]+ mm before target T042\."):
-        Multilateration().identify(raw, Settings(parametric=False))
+        Multilateration().identify(raw, MultilaterationSettings(parametric=False))
 
 
 def _with_air(raw):
@@ -500,9 +502,9 @@ def test_rows_of_nan_are_ignored_or_reported(raw, name, row, message):
     broken[name][row] = np.nan
     if message is not None:
         with pytest.raises((MethodError, DatasetError), match=message):
-            Multilateration().identify(broken, Settings(parametric=False))
+            Multilateration().identify(broken, MultilaterationSettings(parametric=False))
         return
-    found = Multilateration().identify(broken, Settings(parametric=False))
+    found = Multilateration().identify(broken, MultilaterationSettings(parametric=False))
     lost = np.isnan(found["EX"].values)
     assert np.flatnonzero(lost).tolist() == ([7] if name == "displacement" else [])
     assert np.isfinite(np.sqrt(np.einsum("tii->ti", found["covariance"].values[:, :3, :3]))[~lost]).all()

@@ -9,7 +9,7 @@ from errormotion.methods.multilateration import Multilateration
 from errormotion.methods.multilateration.networks import solve
 from errormotion.methods.multilateration.planning import layout
 from errormotion.methods.multilateration.planning.plan import boxes_of, reading_noise
-from errormotion.methods.multilateration.settings import Box, Planning, Settings
+from errormotion.methods.multilateration.settings import Box, MultilaterationSettings, Planning
 
 pytestmark = pytest.mark.usefixtures("short_searches")
 
@@ -28,7 +28,7 @@ STILL = {
 
 
 def planned(planning=ROOM, **changes):
-    return Multilateration().plan(Settings(**({"layout": LAYOUT, "planning": planning} | changes)))
+    return Multilateration().plan(MultilaterationSettings(**({"layout": LAYOUT, "planning": planning} | changes)))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_a_plan_is_an_error_dataset_of_zeros_that_conforms_to_the_schema(ds):
 
 
 def test_expected_uncertainty_is_the_scatter_of_measurements():
-    settings = Settings(layout=LAYOUT, air=STILL, scale_uncertainty=0.0, planning=NARROW)
+    settings = MultilaterationSettings(layout=LAYOUT, air=STILL, scale_uncertainty=0.0, planning=NARROW)
     ds = Multilateration().plan(settings)
     target, U = layout.grid(settings.layout)[1], np.array(CLOSE)
     rng = np.random.default_rng(2)
@@ -78,7 +78,7 @@ def test_uncertainty_of_the_air_is_one_scale_for_all_targets(ds):
     still = planned(NARROW, air=STILL)
     assert "air temperature" not in still["source"].values
     scale = ds["influence"].sel(source="air temperature").values[:, :3]
-    target = layout.grid(Settings(layout=LAYOUT).layout)[1]
+    target = layout.grid(MultilaterationSettings(layout=LAYOUT).layout)[1]
     # 0.2 K of air: 0.95 um/m a kelvin.
     np.testing.assert_allclose(scale, 0.19e-6 * (target - target.mean(axis=0)), rtol=0.02, atol=1e-12)
 
@@ -97,7 +97,7 @@ def test_the_uncertainty_of_the_expansion_is_in_the_plan():
 
 
 def test_repeatability_is_included_with_separate_set_ups():
-    settings = Settings(layout=LAYOUT, repeatability=2e-6)
+    settings = MultilaterationSettings(layout=LAYOUT, repeatability=2e-6)
     assert reading_noise(settings) == pytest.approx(np.sqrt(5) * 1e-6)
     assert reading_noise(settings.model_copy(update={"together": True})) == pytest.approx(1e-6)
 
@@ -140,14 +140,16 @@ def test_without_boxes_no_station_is_closer_to_the_targets():
 
 
 def test_the_method_has_a_plan():
-    flat = Settings(layout=LAYOUT | {"count": (2, 2, 2), "stations": [(0.3 * k, 0.2, 0.5) for k in range(-2, 2)]})
+    flat = MultilaterationSettings(
+        layout=LAYOUT | {"count": (2, 2, 2), "stations": [(0.3 * k, 0.2, 0.5) for k in range(-2, 2)]}
+    )
     with pytest.raises(MethodError):  # on one line: nothing to be determined
         Multilateration().plan(flat)
 
 
 def test_groups_and_uncertainties_of_the_plan_are_those_of_the_result():
-    stations = Settings().layout.stations
-    settings = Settings(
+    stations = MultilaterationSettings().layout.stations
+    settings = MultilaterationSettings(
         planning=Planning(boxes=tuple(Box(low=U, high=U) for U in stations), acceptance=np.pi),
         expansion={"coefficient": 11.5e-6, "temperature": 22.0},
         repeatability=0.4e-6,

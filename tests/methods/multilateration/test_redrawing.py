@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import SeedSequence
 
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.montecarlo.trials import redrawing_of, sample, values_of
 from errormotion.twin import VirtualMachine
 
@@ -17,7 +17,7 @@ def test_each_source_has_the_spread_of_its_group():
     q = simulation.target_grid(machine, (4, 4, 3))
     drift = np.tile([2e-9, 5e-10, 0.0, -3e-10], (4, 1))
     raw = simulation.raw(machine, np.concatenate([q, q[::6]]), seed=4, drift=drift)
-    settings = Settings(expansion={"coefficient": 11.5e-6, "temperature": 23.0}, parametric=False)
+    settings = MultilaterationSettings(expansion={"coefficient": 11.5e-6, "temperature": 23.0}, parametric=False)
     errors = Multilateration().identify(raw, settings)
     redrawing = redrawing_of(Multilateration(), raw, settings, errors)
     F, groups = errors["influence"].values[..., :3], errors["source_group"].values

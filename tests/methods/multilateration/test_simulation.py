@@ -6,7 +6,7 @@ from scipy.stats import chi2
 
 from errormotion import datasets
 from errormotion.errors import BenchError
-from errormotion.methods.multilateration import Multilateration, Settings, simulation
+from errormotion.methods.multilateration import Multilateration, MultilaterationSettings, simulation
 from errormotion.methods.multilateration.simulation import NOISE, REFLECTOR
 from errormotion.twin import VirtualMachine
 
@@ -65,7 +65,7 @@ def test_targets_out_of_the_travel_are_refused(machine):
 
 
 def test_the_layout_of_the_settings_is_simulated_with_its_true_errors():
-    settings = Settings(layout={"count": (4, 4, 3), "reflector": ("20 mm", "0 mm", "-80 mm")})
+    settings = MultilaterationSettings(layout={"count": (4, 4, 3), "reflector": ("20 mm", "0 mm", "-80 mm")})
     raw, truth = Multilateration.simulate(settings, 4)
     datasets.validate(raw)
     assert raw["displacement"].shape == (4, 48)
@@ -78,7 +78,7 @@ def test_the_layout_of_the_settings_is_simulated_with_its_true_errors():
 
 def test_simulated_data_contain_all_sources_that_the_result_states():
     """The size of the volume along X: 40 independent draws of expansion, air and tracker, far above the noise."""
-    settings = Settings(
+    settings = MultilaterationSettings(
         scale_uncertainty=3e-6,
         air={"temperature_uncertainty": 2.0},
         expansion={"coefficient": 11.5e-6, "temperature": 24.0, "temperature_uncertainty": 0.5},

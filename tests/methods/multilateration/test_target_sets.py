@@ -16,7 +16,7 @@ from errormotion.methods.multilateration.planning.choosing import positions, ref
 from errormotion.methods.multilateration.planning.sight import Sight
 from errormotion.methods.multilateration.planning.target_sets import Expected, Volume
 from errormotion.methods.multilateration.result import OF_DATUM
-from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
+from errormotion.methods.multilateration.settings import Choosing, MultilaterationSettings, Planning
 
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
 STATIONS = np.array([(-0.75, -0.6, -0.1), (0.8, -0.55, 0.0), (0.7, 0.65, -0.05), (-0.6, 0.5, 0.8)])
@@ -157,7 +157,9 @@ BOXES = [
 
 def planned(**changes):
     targets = {"count": 27, "candidates": (4, 4, 4), "uncertainty": "target"} | changes
-    settings = Settings(**SETTINGS, planning={"boxes": BOXES, "targets": targets, "acceptance": np.radians(50)})
+    settings = MultilaterationSettings(
+        **SETTINGS, planning={"boxes": BOXES, "targets": targets, "acceptance": np.radians(50)}
+    )
     return settings, Multilateration().plan(settings)
 
 
@@ -199,7 +201,7 @@ def test_chosen_targets_are_within_the_acceptance_angle_of_the_reflector(made):
 def test_a_campaign_measures_the_chosen_targets(made, tmp_path):
     _, ds = made
     text = tomllib.loads(ds.attrs["best_layout"])["test"]["settings"]["layout"]
-    again = Settings(layout=text)
+    again = MultilaterationSettings(layout=text)
     position, place = layout.grid(again.layout)
     np.testing.assert_allclose(position, ds["map_position"].values[ds["chosen"].values == 1], atol=0.5e-6)
     np.testing.assert_allclose(place - position, np.tile(REFLECTOR, (27, 1)), atol=1e-12)
@@ -209,7 +211,7 @@ def test_a_campaign_measures_the_chosen_targets(made, tmp_path):
     tour, listed = (np.abs(np.diff(way, axis=0)).max(axis=1).sum() for way in (position[order], position))
     assert tour < listed
     file = tmp_path / "best.toml"
-    where = Settings(
+    where = MultilaterationSettings(
         **SETTINGS, planning={"boxes": [{"low": U, "high": U} for U in map(tuple, STATIONS)], "write": file}
     )
     assert f"The best layout is in {file}" in "\n".join(Multilateration().plan(where).attrs["notes"])
@@ -238,7 +240,9 @@ def test_wrong_settings_are_refused_with_a_remedy():
         Choosing(count=12, low=(0, 0, 0))
     with pytest.raises(MethodError, match="chain: expected the chain of the machine"):
         Multilateration().plan(
-            Settings(layout=SETTINGS["layout"], planning={"targets": {"count": 20, "candidates": (3, 3, 3)}}),
+            MultilaterationSettings(
+                layout=SETTINGS["layout"], planning={"targets": {"count": 20, "candidates": (3, 3, 3)}}
+            ),
         )
 
 

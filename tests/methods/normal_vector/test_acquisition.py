@@ -11,7 +11,7 @@ import xarray as xr
 
 from errormotion import datasets
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings, simulation
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings, simulation
 from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.methods.normal_vector.acquisition.live import LiveBalls
 from errormotion.plugins import Contact, Identity, InstrumentInfo
@@ -23,9 +23,9 @@ SPINNING = [{"at": 0.0, "spindle_speed": 9000.0}]
 LENGTH = 100.0  # of a cycle, s
 
 
-def settings(**options) -> Settings:
+def settings(**options) -> NormalVectorSettings:
     basic = {"balls": BALLS, "touches": 4, "duration": 2400.0, "interval": 600.0, "schedule": SPINNING}
-    return Settings(**(basic | options))
+    return NormalVectorSettings(**(basic | options))
 
 
 class Control:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from errormotion.instruments.controller.virtual import VirtualController
 from errormotion.instruments.simulators import reset, world
 from errormotion.instruments.touch_probe.controller_probe import ControllerProbe, ControllerProbeSettings
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.plugins import Touch
 from errormotion.twin import VirtualMachine
@@ -22,8 +22,10 @@ BALLS = [{"centre": tuple(place)} for place in GANTRY.balls.nominal.tolist()]
 MINUTE = 60.0
 
 
-def settings(**options) -> Settings:
-    return Settings(**({"balls": BALLS[:3], "touches": 4, "duration": 40 * MINUTE, "interval": 20 * MINUTE} | options))
+def settings(**options) -> NormalVectorSettings:
+    return NormalVectorSettings(
+        **({"balls": BALLS[:3], "touches": 4, "duration": 40 * MINUTE, "interval": 20 * MINUTE} | options)
+    )
 
 
 class Bench:
@@ -88,7 +90,7 @@ def test_steps_equal_the_motions_of_the_machine(monkeypatch, moves) -> None:
 
 
 def test_no_steps_without_balls() -> None:
-    assert cycle.cycle_steps(Settings()) == []
+    assert cycle.cycle_steps(NormalVectorSettings()) == []
 
 
 @given(

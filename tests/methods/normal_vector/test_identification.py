@@ -10,7 +10,7 @@ from errormotion.datasets import validate
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.measurement.identification import solve
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.conformance import subjects
 
 METHOD = NormalVector()
@@ -40,7 +40,7 @@ def test_recovers_truth_with_true_uncertainty_on_a_gantry(probed, off):
 def test_c_frame_taken_for_a_gantry_is_reported(probed, off):
     machine, raw = probed("cframe", seed=3)
     del raw.attrs["tool_axes"]
-    right, wrong = (METHOD.identify(raw, Settings(tool_axes=axes, robust=False)) for axes in ("Z", "XYZ"))
+    right, wrong = (METHOD.identify(raw, NormalVectorSettings(tool_axes=axes, robust=False)) for axes in ("Z", "XYZ"))
     assert np.nanmax(np.abs(off(machine, right))) < 4
     assert any("scatter" in note and "tool_axes" in note for note in wrong.attrs["notes"])
     assert not any("scatter" in note for note in right.attrs["notes"])
@@ -72,7 +72,7 @@ def test_assumed_axes_of_the_tool_are_in_a_note(probed):
     unknown = raw.drop_attrs(deep=False).assign_attrs({k: v for k, v in raw.attrs.items() if k != "tool_axes"})
     assumed = "Assumed, because it is not stated: X, Y and Z carry the tool (tool_axes = XYZ)."
     assert assumed in METHOD.identify(unknown).attrs["notes"]
-    for stated in (METHOD.identify(raw), METHOD.identify(unknown, Settings(tool_axes="XYZ"))):
+    for stated in (METHOD.identify(raw), METHOD.identify(unknown, NormalVectorSettings(tool_axes="XYZ"))):
         assert assumed not in stated.attrs["notes"]
 
 
@@ -82,18 +82,18 @@ def test_without_interpolation_a_cycle_has_the_mean_time_of_its_valid_touches(pr
     flag = raw["touch_flag"].values.copy()
     flag[2, :, :2] = 1  # missing touches are not part of the mean
     raw = raw.assign(touch_flag=(raw["touch_flag"].dims, flag, raw["touch_flag"].attrs))
-    errors = METHOD.identify(raw, Settings(interpolate=False))
+    errors = METHOD.identify(raw, NormalVectorSettings(interpolate=False))
     expected = np.where(flag == 0, raw["touch_time"].values, np.nan)
     np.testing.assert_allclose(errors["time"].values, np.nanmean(expected, axis=(1, 2)), atol=1e-9)
     assert errors["time"].values[2] > raw["touch_time"].values[2].mean() + 1.0
     np.testing.assert_array_equal(errors["cycle_time"].values, raw["time"].values)
-    untimed = METHOD.identify(raw.drop_vars("touch_time"), Settings(interpolate=False))
+    untimed = METHOD.identify(raw.drop_vars("touch_time"), NormalVectorSettings(interpolate=False))
     np.testing.assert_array_equal(untimed["time"].values, raw["time"].values)
 
 
 def test_data_state_the_axes_that_carry_the_tool(probed):
     _, raw = probed("cframe")
-    errors = METHOD.identify(raw, Settings(tool_axes="XYZ"))
+    errors = METHOD.identify(raw, NormalVectorSettings(tool_axes="XYZ"))
     assert errors.attrs["tool_axes"] == "Z"
     assert np.isnan(errors["EC"]).all()
     assert np.isnan(errors["normals_errors"]).all()
@@ -128,7 +128,7 @@ def test_apparent_motion_of_balls_is_opposite_to_the_error(probed):
 
 def test_error_at_another_point_is_that_of_the_moved_twist(probed):
     _, raw = probed()
-    here, there = METHOD.identify(raw), METHOD.identify(raw, Settings(functional_point=(0.5, 0.2, 0.1)))
+    here, there = METHOD.identify(raw), METHOD.identify(raw, NormalVectorSettings(functional_point=(0.5, 0.2, 0.1)))
     moved = here.em.at((0.5, 0.2, 0.1))
     for name in DOF:
         # The same up to the square of the turn, 1e-9 of the lever.
@@ -183,8 +183,8 @@ def test_noise_above_the_stated_one_is_reported_and_included(probed):
     _, raw = probed(noise=0.8e-6)
     raw["touch_noise"] = raw["touch_noise"] * 0 + 0.25e-6
     raised, kept = (
-        METHOD.identify(raw, Settings(robust=False)),
-        METHOD.identify(raw, Settings(noise="stated", robust=False)),
+        METHOD.identify(raw, NormalVectorSettings(robust=False)),
+        METHOD.identify(raw, NormalVectorSettings(noise="stated", robust=False)),
     )
     assert float(raised["noise"]) == pytest.approx(0.8e-6, rel=0.25)
     assert float(kept["noise"]) == pytest.approx(0.25e-6)
@@ -213,7 +213,7 @@ def test_centres_without_covariance_have_it_from_their_scatter(probed, off):
 
 def test_procedure_normals_gives_the_published_estimate_with_its_own_uncertainty(probed, off):
     machine, raw = probed()
-    rigid, normals = METHOD.identify(raw), METHOD.identify(raw, Settings(procedure="normals"))
+    rigid, normals = METHOD.identify(raw), METHOD.identify(raw, NormalVectorSettings(procedure="normals"))
     np.testing.assert_array_equal(normals["EA"].values, rigid["normals_errors"].sel(dof="EA").values)
     np.testing.assert_allclose(sigma(normals)[1:] / sigma(rigid)[1:], rigid["normals_loss"].values[1:])
     assert np.nanmax(np.abs(off(machine, normals))) < 4
@@ -224,7 +224,7 @@ def test_procedure_normals_gives_the_published_estimate_with_its_own_uncertainty
 def test_normals_of_other_balls_are_other_normals(probed):
     _, raw = probed(balls=6)
     first, other = (
-        METHOD.identify(raw, Settings(normals_balls=balls))["normals_loss"].values[-1]
+        METHOD.identify(raw, NormalVectorSettings(normals_balls=balls))["normals_loss"].values[-1]
         for balls in (None, ("B2", "B4", "B5", "B1"))
     )
     assert np.abs(first - other).max() > 0.05
@@ -232,7 +232,7 @@ def test_normals_of_other_balls_are_other_normals(probed):
 
 def test_first_cycle_for_the_reference_where_there_is_no_cold_one(probed):
     _, raw = probed()
-    late = METHOD.identify(raw.isel(time=slice(2, None)), Settings(reference="first"))
+    late = METHOD.identify(raw.isel(time=slice(2, None)), NormalVectorSettings(reference="first"))
     whole = METHOD.identify(raw)
     difference = whole["EZ"].values[2:] - whole["EZ"].values[2]
     np.testing.assert_allclose(

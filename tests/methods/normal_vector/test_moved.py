@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings, simulation
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings, simulation
 
 METHOD = NormalVector()
 
@@ -30,7 +30,7 @@ def test_moved_ball_is_named_with_the_cycle_and_does_no_harm(probed, off, kind, 
 
 def test_moved_ball_does_harm_where_nothing_may_be_left_out(probed, off):
     machine, raw = probed(moved=(1, 1500.0, (5e-6, -3e-6, 0.0)))
-    errors = METHOD.identify(raw, Settings(robust=False, noise="stated"))
+    errors = METHOD.identify(raw, NormalVectorSettings(robust=False, noise="stated"))
     assert np.nanmax(np.abs(off(machine, errors))) > 8
 
 
@@ -91,7 +91,7 @@ def test_wrong_touches_in_many_cycles_are_all_found(probed, off):
 
 def test_ball_that_creeps_by_less_than_asked_for_is_left_alone(probed):
     _, raw = probed(moved=(0, 1500.0, (2e-6, 0.0, 0.0)))
-    assert not moves(METHOD.identify(raw, Settings(smallest_move=10e-6)))
+    assert not moves(METHOD.identify(raw, NormalVectorSettings(smallest_move=10e-6)))
 
 
 def test_cold_cycle_in_which_all_is_wrong_is_refused(probed):

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.normal_vector import Ball, NormalVector, Settings
+from errormotion.methods.normal_vector import Ball, NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.acquisition.touching import touch_normals
 
 METHOD = NormalVector()
@@ -19,7 +19,7 @@ def sigma(errors):
 def settings_of(raw, **more):
     balls = tuple(Ball(centre=tuple(place), radius=12.5e-3, name=str(name))
                   for place, name in zip(raw["ball_nominal"].values, raw["ball"].values, strict=True))  # fmt: skip
-    return Settings(balls=balls, interval=600.0, duration=3600.0, tool_axes=raw.attrs["tool_axes"], **more)
+    return NormalVectorSettings(balls=balls, interval=600.0, duration=3600.0, tool_axes=raw.attrs["tool_axes"], **more)
 
 
 @pytest.mark.parametrize("kind", ["gantry", "cframe"])
@@ -44,15 +44,15 @@ def test_plan_says_what_a_c_frame_does_not_show(probed):
 def test_plan_of_balls_that_do_not_do_is_refused():
     one_height = tuple(Ball(centre=(x, y, 0.1)) for x, y in ((0, 0), (0.2, 0), (0, 0.2), (0.2, 0.2)))
     with pytest.raises(MethodError, match="different positions along Z"):
-        METHOD.plan(Settings(balls=one_height, tool_axes="Z"))
-    planned = METHOD.plan(Settings(balls=one_height, tool_axes="XYZ"))
+        METHOD.plan(NormalVectorSettings(balls=one_height, tool_axes="Z"))
+    planned = METHOD.plan(NormalVectorSettings(balls=one_height, tool_axes="XYZ"))
     assert np.isfinite(sigma(planned)).all()
     assert np.isinf(planned["normals_loss"]).all()
     assert "both normals are equal" in planned.attrs["notes"][-1]
     with pytest.raises(MethodError, match="found 0"):
-        METHOD.plan(Settings())
+        METHOD.plan(NormalVectorSettings())
     with pytest.raises(MethodError, match="has none"):
-        METHOD.plan(Settings(balls=one_height, duration=60.0))
+        METHOD.plan(NormalVectorSettings(balls=one_height, duration=60.0))
 
 
 def test_more_balls_and_touches_are_better(probed):
@@ -86,4 +86,4 @@ def test_touches_lie_around_the_ball_and_on_top():
 )
 def test_settings_that_contradict_themselves_are_refused(wrong, message):
     with pytest.raises(ValidationError, match=message):
-        Settings(**wrong)
+        NormalVectorSettings(**wrong)

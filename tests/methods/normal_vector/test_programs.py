@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.acquisition import cycle
 from errormotion.methods.normal_vector.acquisition.programs import CYCLE, WARM_UP, cycle_program
 from errormotion.twin import VirtualMachine
@@ -24,7 +24,7 @@ MINUTE = 60.0
 class Nominal:
     """Balls where they are said to be, and a log of what the program orders."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: NormalVectorSettings) -> None:
         self.settings = settings
         self.speeds: list[tuple[float, float]] = []
         self.lines: list[str] = []
@@ -49,11 +49,13 @@ class Nominal:
         return time
 
 
-def settings(**options) -> Settings:
-    return Settings(**({"balls": BALLS[:3], "touches": 4, "duration": 40 * MINUTE, "interval": 20 * MINUTE} | options))
+def settings(**options) -> NormalVectorSettings:
+    return NormalVectorSettings(
+        **({"balls": BALLS[:3], "touches": 4, "duration": 40 * MINUTE, "interval": 20 * MINUTE} | options)
+    )
 
 
-def walked(chosen: Settings, name: str):
+def walked(chosen: NormalVectorSettings, name: str):
     """Return the path of a program from a place high above, and what it ordered."""
     orders = Nominal(chosen)
     start = cycle.cycle_steps(chosen)[0].place
@@ -163,4 +165,4 @@ def test_the_first_touch_of_a_ball_names_it_as_a_control_can_read_it() -> None:
 
 def test_no_program_without_balls() -> None:
     with pytest.raises(MethodError, match="three or more balls; found none"):
-        NormalVector().programs(Settings())
+        NormalVector().programs(NormalVectorSettings())

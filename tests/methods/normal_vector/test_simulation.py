@@ -6,7 +6,7 @@ import pytest
 from errormotion import datasets
 from errormotion.errors import BenchError, MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.simulation import raw
 from errormotion.twin import Event, VirtualMachine
 from errormotion.twin.artefacts.balls import NOISE
@@ -160,7 +160,7 @@ def test_every_touch_hits_its_ball(kind, seed):
 
 @pytest.mark.parametrize("tool_axes", ["XYZ", "Z"])
 def test_simulated_truth_lies_within_the_stated_uncertainty(tool_axes):
-    settings = Settings(tool_axes=tool_axes, duration=1800.0, interval=600.0)
+    settings = NormalVectorSettings(tool_axes=tool_axes, duration=1800.0, interval=600.0)
     data, truth = NormalVector.simulate(settings, 3)
     errors = NormalVector().identify(data, settings)
     # both are rounded to 0.1 mm, one from the probed centres, the other from those without pre-travel and noise
@@ -175,4 +175,4 @@ def test_simulated_truth_lies_within_the_stated_uncertainty(tool_axes):
 
 def test_simulation_without_a_machine_of_these_axes_is_refused():
     with pytest.raises(MethodError, match="expected XYZ or Z for a simulation; found 'XZ'"):
-        NormalVector.simulate(Settings(tool_axes="XZ"), 1)
+        NormalVector.simulate(NormalVectorSettings(tool_axes="XZ"), 1)

@@ -6,7 +6,7 @@ import xarray as xr
 from pydantic import ValidationError
 
 from errormotion.errors import DatasetError, MethodError
-from errormotion.methods.normal_vector import NormalVector, Settings
+from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 
 METHOD = NormalVector()
 
@@ -20,7 +20,7 @@ def moved(raw, shift):
 
 def refused(raw, match, error=MethodError, **settings):
     with pytest.raises(error, match=match):
-        METHOD.identify(raw, Settings(**settings))
+        METHOD.identify(raw, NormalVectorSettings(**settings))
 
 
 def test_fewer_than_three_balls(probed):
@@ -40,13 +40,13 @@ def test_balls_at_one_height_on_a_c_frame_are_enough_for_a_gantry_alone(probed):
     shift[:, 2] = 0.1 - raw["ball_nominal"].values[:, 2]
     raw = moved(raw, shift)
     refused(raw, r"only by balls at different positions along Z.*EA, EB cannot be distinguished.*posts")
-    errors = METHOD.identify(raw.assign_attrs(tool_axes="XYZ"), Settings(robust=False))
+    errors = METHOD.identify(raw.assign_attrs(tool_axes="XYZ"), NormalVectorSettings(robust=False))
     assert np.isfinite(errors["EC"]).all()
     assert any("both normals are equal" in note for note in errors.attrs["notes"])
 
 
 def test_no_axis_carries_the_tool_so_that_only_displacements_show(probed):
-    errors = METHOD.identify(probed("cframe")[1].assign_attrs(tool_axes=""), Settings(robust=False))
+    errors = METHOD.identify(probed("cframe")[1].assign_attrs(tool_axes=""), NormalVectorSettings(robust=False))
     assert np.isnan(errors["EA"]).all()
     assert np.isfinite(errors["EX"]).all()
 
@@ -170,4 +170,4 @@ def test_invalid_balls_are_refused_before_any_touch(settings, said):
     places = [(0.0, 0.0, 0.0), (0.4, 0.0, 0.0), (0.0, 0.3, 0.0), settings.pop("centre_of_4", (0.4, 0.3, 0.2))]
     balls = [{"centre": [f"{x * 1e3} mm" for x in place]} for place in places]
     with pytest.raises(ValidationError, match=said):
-        Settings(balls=balls, **settings)
+        NormalVectorSettings(balls=balls, **settings)

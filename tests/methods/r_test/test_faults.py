@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 
-METHOD, SETTINGS, FOUR = RTest(), Settings(), Settings(spheres=4)
+METHOD, SETTINGS, FOUR = RTest(), RTestSettings(), RTestSettings(spheres=4)
 
 
 def simulated(seed: int = 0) -> tuple[xr.Dataset, xr.Dataset]:

@@ -7,7 +7,7 @@ import xarray as xr
 from errormotion import datasets
 from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 
 METHOD = RTest()
 SEEDS = 60
@@ -18,7 +18,7 @@ def known(errors: xr.Dataset) -> list[str]:
     return [name for name in DOF if np.isfinite(errors[name].values).any()]
 
 
-def placed(settings: Settings, place: np.ndarray) -> xr.Dataset:
+def placed(settings: RTestSettings, place: np.ndarray) -> xr.Dataset:
     """Return readings of noise only, of spheres at other places."""
     raw = METHOD.expected(settings).isel(sphere=slice(0, 1))
     raw = raw.drop_vars(["displacement", "sphere_position"])
@@ -30,7 +30,7 @@ def placed(settings: Settings, place: np.ndarray) -> xr.Dataset:
 
 def test_location_errors_are_covered() -> None:
     """95 % of the intervals of four location errors over 60 seeds, within three standard deviations and a bit."""
-    settings = Settings(angles=12)
+    settings = RTestSettings(angles=12)
     inside = []
     for seed in range(SEEDS):
         raw, truth = METHOD.simulate(settings, seed)
@@ -42,7 +42,7 @@ def test_location_errors_are_covered() -> None:
 
 
 def test_the_covariance_of_location_errors_is_that_of_their_sources() -> None:
-    errors = METHOD.plan(Settings())
+    errors = METHOD.plan(RTestSettings())
     F, C = errors["location_influence"].values, errors["location_covariance"].values
     assert pytest.approx(C, rel=1e-9, abs=1e-24) == F.T @ F
     of_nest = F[errors["source_group"].values == "zero of the nest"]
@@ -52,7 +52,7 @@ def test_the_covariance_of_location_errors_is_that_of_their_sources() -> None:
 
 def test_the_covariance_is_the_bound_with_known_constants() -> None:
     """Dense information matrix of all unknowns: 6 an angle, 3 a sphere; the datum is a projection."""
-    settings = Settings(
+    settings = RTestSettings(
         angles=15, gain_uncertainty=0, direction_uncertainty=0, nest_uncertainty=0, position_uncertainty=0
     )
     raw = METHOD.expected(settings)
@@ -90,7 +90,7 @@ def test_the_covariance_is_the_bound_with_known_constants() -> None:
 
 
 def test_one_sphere_on_the_axis_determines_displacements() -> None:
-    settings = Settings(spheres=1)
+    settings = RTestSettings(spheres=1)
     errors = METHOD.identify(METHOD.simulate(settings, 0)[0])
     assert known(errors) == ["EX", "EY", "EZ"]
     assert np.isfinite(errors["location_error"].values).tolist() == [True, True, False, False]
@@ -110,7 +110,7 @@ def test_one_sphere_on_the_axis_determines_displacements() -> None:
     ],
 )
 def test_what_the_spheres_do_not_determine_is_unknown(place: list, freedoms: list | None) -> None:
-    raw = placed(Settings(), np.array(place, dtype=float))
+    raw = placed(RTestSettings(), np.array(place, dtype=float))
     if freedoms is None:
         with pytest.raises(MethodError, match="No freedom of axis C follows"):
             METHOD.identify(raw)
@@ -119,13 +119,13 @@ def test_what_the_spheres_do_not_determine_is_unknown(place: list, freedoms: lis
 
 
 def test_two_sensors_are_refused() -> None:
-    raw, _ = METHOD.simulate(Settings(), 0)
+    raw, _ = METHOD.simulate(RTestSettings(), 0)
     with pytest.raises(MethodError, match="fewer than three sensors"):
         METHOD.identify(raw.isel(sensor=slice(0, 2)))
 
 
 def test_missing_readings_leave_angles_unknown() -> None:
-    raw, truth = METHOD.simulate(Settings(), 0)
+    raw, truth = METHOD.simulate(RTestSettings(), 0)
     raw["displacement"][4, 1:] = np.nan  # one sphere is left
     raw["displacement"][7, 2, 0] = np.nan  # eight readings are left
     errors = METHOD.identify(raw)
@@ -137,7 +137,7 @@ def test_missing_readings_leave_angles_unknown() -> None:
 
 
 def test_the_axis_is_never_assumed() -> None:
-    raw, _ = METHOD.simulate(Settings(), 0)
+    raw, _ = METHOD.simulate(RTestSettings(), 0)
     del raw.attrs["axis"]
     with pytest.raises(MethodError, match="'axis' of the raw data: expected A, B or C"):
         METHOD.identify(raw)
@@ -149,7 +149,7 @@ def test_the_axis_is_never_assumed() -> None:
 
 
 def test_angles_increase() -> None:
-    raw, _ = METHOD.simulate(Settings(), 0)
+    raw, _ = METHOD.simulate(RTestSettings(), 0)
     with pytest.raises(MethodError, match="angles that increase"):
         METHOD.identify(raw.isel(angle=slice(None, None, -1)))
     with pytest.raises(MethodError, match="at least 4 angles"):
@@ -171,13 +171,13 @@ def test_figures_state_location_errors_with_the_effect_of_each_source() -> None:
     assert [each.name for each in METHOD.figures(METHOD.plan(settings))] == list(found)[:4]
 
 
-def replace_axis(axis: str) -> Settings:
-    return Settings().model_copy(update={"axis": axis})
+def replace_axis(axis: str) -> RTestSettings:
+    return RTestSettings().model_copy(update={"axis": axis})
 
 
 def test_a_large_offset_is_part_of_the_lever() -> None:
     """A plate 2 mm off its place: 40 urad times 2 mm are 80 nm, which would be half of the noise."""
-    raw, _ = METHOD.simulate(Settings(noise=1e-9, gain_uncertainty=0, direction_uncertainty=0), 0)
+    raw, _ = METHOD.simulate(RTestSettings(noise=1e-9, gain_uncertainty=0, direction_uncertainty=0), 0)
     nominal = raw.copy()
     nominal["sphere_position"] = raw["sphere_position"] - [2e-3, 1e-3, 0.0]
     turn = raw["angle"].values

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 from errormotion.report import Form, write_report
 from errormotion.report.document import Source
 from errormotion.report.text import rounded
@@ -22,7 +22,7 @@ ARCSEC = np.pi / 180 / 3600
 @pytest.fixture(scope="module")
 def measured():
     """Return raw data and the result of a test with three spheres, whose nest has a large uncertainty."""
-    settings = Settings(spheres=3, angles=24, nest_uncertainty=6e-6)
+    settings = RTestSettings(spheres=3, angles=24, nest_uncertainty=6e-6)
     raw, _ = RTest().simulate(settings, seed=1)
     return raw, RTest().identify(raw, settings)
 
@@ -79,7 +79,7 @@ def test_the_reliability_of_the_readings_is_a_table(folder, measured):
 
 
 def test_a_test_with_one_sphere_states_what_it_does_not_determine():
-    settings = Settings(axis="A", spheres=1, angles=12)
+    settings = RTestSettings(axis="A", spheres=1, angles=12)
     errors = RTest().identify(RTest().simulate(settings, seed=1)[0], settings)
     (part,) = chapters(Source(errors))
     assert "Not determined: EAA, EBA and ECA. Reported as unknown, not as zero." in part.summary
@@ -87,6 +87,6 @@ def test_a_test_with_one_sphere_states_what_it_does_not_determine():
 
 
 def test_a_plan_has_the_generic_chapter():
-    (part,) = chapters(Source(RTest().plan(Settings())))
+    (part,) = chapters(Source(RTest().plan(RTestSettings())))
     assert part.title == "Errors of component C"
     assert not any("large against" in words for words in part.summary)

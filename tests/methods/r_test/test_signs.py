@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from errormotion.kinematics.iso import DOF
 from errormotion.kinematics.machines import Machine
-from errormotion.methods.r_test import RTest, Settings
+from errormotion.methods.r_test import RTest, RTestSettings
 from errormotion.methods.r_test.layout import Layout, expected
 
 ANGLE = np.arange(24) * 2 * np.pi / 24
@@ -53,7 +53,7 @@ def test_raw_data_of_matrices_give_back_the_errors() -> None:
             actual = (table @ np.r_[p + own[i], 1.0])[:3]
             nominal = (turned @ np.r_[p, 1.0])[:3]
             reading[a, i] = sensor @ (actual - nominal)
-    raw = expected(Settings(angles=ANGLE.size)).drop_dims(["sphere", "sensor"]).assign_coords(angle=ANGLE)
+    raw = expected(RTestSettings(angles=ANGLE.size)).drop_dims(["sphere", "sensor"]).assign_coords(angle=ANGLE)
     raw["angle"].attrs["units"] = "rad"
     raw["displacement"] = (("angle", "sphere", "sensor"), reading)
     raw["sphere_position"] = (("sphere", "direction"), place)

@@ -10,7 +10,7 @@ import xarray as xr
 
 from errormotion.datasets import clock
 from errormotion.errors import InstrumentError, MethodError
-from errormotion.methods.spindle_drift import Event, Settings, SpindleDrift
+from errormotion.methods.spindle_drift import Event, SpindleDrift, SpindleDriftSettings
 from errormotion.methods.spindle_drift.acquisition.drift import CHUNK_SAMPLES, MAX_FAILED_POLLS
 from errormotion.plugins import Samples
 from errormotion.twin import VirtualMachine
@@ -72,7 +72,7 @@ def record(bench, settings, done=None):
 
 def test_record_is_complete_and_counts_lost_samples():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
-    chunks, raw = record(bench, Settings(duration=10.2, schedule=(Event(at=2.0, spindle_speed=3000.0),)))
+    chunks, raw = record(bench, SpindleDriftSettings(duration=10.2, schedule=(Event(at=2.0, spindle_speed=3000.0),)))
     assert raw.sizes["time"] == 10200
     np.testing.assert_allclose(np.diff(raw["distance"].values[0]), 1e-12, rtol=1e-3)
     assert sum(chunk.attrs["dropped"] for chunk in chunks) == 21
@@ -88,14 +88,14 @@ def test_record_starts_with_its_first_sample_and_not_with_the_prompt():
             self.answered = datetime.now(UTC)
 
     bench = Slow(spindle_frame=Frame())
-    chunks, _ = record(bench, Settings(duration=2.0))
+    chunks, _ = record(bench, SpindleDriftSettings(duration=2.0))
     # The first block holds half a second that lay before it came.
     assert datetime.fromisoformat(chunks[0].attrs["start"]) > bench.answered - timedelta(seconds=0.51)
 
 
 def test_interruption_of_the_thermometer_loses_only_temperatures():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=(3, 4)))
-    chunks, raw = record(bench, Settings(duration=10.0))
+    chunks, raw = record(bench, SpindleDriftSettings(duration=10.0))
     warmth = raw["temperature"].sel(sensor="frame").values
     assert np.isnan(warmth[2000:6000]).all()
     assert np.isfinite(np.delete(warmth, slice(2000, 6000))).all()
@@ -106,18 +106,18 @@ def test_interruption_of_the_thermometer_loses_only_temperatures():
 def test_permanent_failure_of_the_thermometer_ends_the_record():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer(fails=range(3, 1000)))
     with pytest.raises(InstrumentError, match="no answer"):
-        record(bench, Settings(duration=2.0 * (MAX_FAILED_POLLS + 10)))
+        record(bench, SpindleDriftSettings(duration=2.0 * (MAX_FAILED_POLLS + 10)))
 
 
 def interrupted(ago):
     """Return a record that started ``ago`` seconds ago and was interrupted after one second."""
-    _, raw = record(Bench(spindle_frame=Frame(), thermometer=Thermometer()), Settings(duration=1.0))
+    _, raw = record(Bench(spindle_frame=Frame(), thermometer=Thermometer()), SpindleDriftSettings(duration=1.0))
     return raw.assign_attrs(start=(datetime.now(UTC) - timedelta(seconds=ago)).isoformat())
 
 
 def test_gap_of_an_interruption_is_nan_and_time_continues():
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
-    settings = Settings(duration=900.0)
+    settings = SpindleDriftSettings(duration=900.0)
     chunks, raw = record(bench, settings, interrupted(600.0))
     assert bench.asked == []
     assert max(chunk.sizes["time"] for chunk in chunks) <= CHUNK_SAMPLES + 500
@@ -142,7 +142,7 @@ def test_change_of_the_clock_neither_hides_nor_creates_a_gap(change, restarted):
     }
     done.attrs[clock.CLOCK] = json.dumps(stored)
     bench = Bench(spindle_frame=Frame(), thermometer=Thermometer())
-    _, raw = record(bench, Settings(duration=900.0), done)
+    _, raw = record(bench, SpindleDriftSettings(duration=900.0), done)
     gap = int(np.isnan(raw["distance"].values[0]).sum())
     assert gap == (1 if restarted else pytest.approx(599_000, abs=5000))  # one row where the duration is unknown
 
@@ -151,13 +151,13 @@ def test_a_record_without_its_start_is_not_continued():
     done = interrupted(10.0)
     del done.attrs["start"]
     with pytest.raises(MethodError, match="cannot be continued"):
-        record(Bench(spindle_frame=Frame()), Settings(duration=900.0), done)
+        record(Bench(spindle_frame=Frame()), SpindleDriftSettings(duration=900.0), done)
 
 
 def test_beams_are_not_scanned_without_a_machine_that_moves():
     with pytest.raises(MethodError, match="instrument of kind 'controller'"):
         list(
             SpindleDrift().acquire(
-                Bench(spindle_frame=Frame()), Settings(procedure="beam_detection"), inputs={}, done=None
+                Bench(spindle_frame=Frame()), SpindleDriftSettings(procedure="beam_detection"), inputs={}, done=None
             )
         )

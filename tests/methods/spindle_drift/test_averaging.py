@@ -13,7 +13,7 @@ from errormotion.methods.spindle_drift import simulation
 from errormotion.methods.spindle_drift.identification import averaging, record
 from errormotion.methods.spindle_drift.identification.averaging import Averager, join, slices, window_sums
 from errormotion.methods.spindle_drift.identification.times import EvenTimes, increases, values_of
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 from errormotion.twin import VirtualMachine
 
 
@@ -134,7 +134,7 @@ def test_a_record_is_averaged_the_same_in_any_slices_and_by_any_number_of_thread
     for cores, size in ((1, 1 << 30), (3, slice_bytes)):
         monkeypatch.setattr(record, "cores", lambda cores=cores: cores)
         monkeypatch.setattr(averaging, "_SLICE_BYTES", size)
-        found.append(record.average_record(raw, Settings()))
+        found.append(record.average_record(raw, SpindleDriftSettings()))
         assert found[-1].hash == whole_hash
     for other in found[1:]:
         np.testing.assert_array_equal(other.averages.count, found[0].averages.count)

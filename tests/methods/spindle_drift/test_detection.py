@@ -5,13 +5,13 @@ import pytest
 import xarray as xr
 
 from errormotion.datasets import load, save, validate
-from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings, simulation
 from errormotion.methods.spindle_drift.acquisition.beams import last_attempts
 from errormotion.methods.spindle_drift.identification.segmentation import scan_seconds
 from errormotion.twin import StepProgram, VirtualMachine
 
 RATE = 1500.0
-SETTINGS = Settings(procedure="beam_detection", steps=21, dwell=0.5, step_average=0.2)
+SETTINGS = SpindleDriftSettings(procedure="beam_detection", steps=21, dwell=0.5, step_average=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_correlation_of_shift_and_rotation_has_its_sign(machine, method):
 
 
 def test_the_plan_predicts_the_uncertainty_of_the_detection(machine, method):
-    plan = method.plan(Settings(procedure="beam_detection"))
+    plan = method.plan(SpindleDriftSettings(procedure="beam_detection"))
     validate(plan)
     beams = method.identify(simulation.raw_beam_detection(machine, seed=2))
     planned, found = (np.sqrt(np.diagonal(d["covariance"].values, axis1=1, axis2=2)) for d in (plan, beams))

@@ -7,7 +7,7 @@ import xarray as xr
 from errormotion.datasets import validate
 from errormotion.errors import DatasetError, MethodError
 from errormotion.estimation.low_rank import whitener
-from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings, simulation
 from errormotion.twin import Event, VirtualMachine
 
 SEEN = slice(0, 5)  # EC is not seen
@@ -45,7 +45,7 @@ def test_stated_intervals_contain_the_truth_and_the_joint_covariance_is_right(ma
     seeds, inside, joint, slopes = 60, [], [], []
     for seed in range(seeds):
         raw = simulation.raw_drift(machine, TIMES, seed=seed, beams=detected(machine, method, 1000 + seed))
-        errors = method.identify(raw, Settings(compensate_frame=False))
+        errors = method.identify(raw, SpindleDriftSettings(compensate_frame=False))
         truth = truth_of(machine, errors)
         miss = np.asarray(errors.em.twist())[:, SEEN] - truth
         covariance = errors["covariance"].values[:, SEEN, SEEN]
@@ -67,7 +67,7 @@ def test_stated_intervals_contain_the_truth_and_the_joint_covariance_is_right(ma
 def test_noise_free_readings_give_the_truth_to_a_tenth_of_a_nanometre(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0, radius_error=False)
     raw["distance"] = (("channel", "time"), machine.still_readings(TIMES, expansion=False, warm_up=False))
-    errors = method.identify(raw, Settings(compensate_frame=False))
+    errors = method.identify(raw, SpindleDriftSettings(compensate_frame=False))
     miss = np.asarray(errors.em.twist())[:, SEEN] - truth_of(machine, errors)
     assert np.abs(miss[:, :3]).max() < 1e-10  # the unseen EC acts over the 12 um to the functional point
     assert np.abs(miss[:, 3:]).max() < 1e-9
@@ -78,7 +78,10 @@ def test_nominal_beams_state_a_larger_uncertainty(machine, method):
     frame = machine.frame
     raw["nominal_origin"] = (("channel", "direction"), frame.nominal_origin)
     raw["nominal_direction"] = (("channel", "direction"), frame.nominal_direction)
-    found = {beams: method.identify(raw, Settings(beams=beams, compensate_frame=False)) for beams in ("raw", "nominal")}
+    found = {
+        beams: method.identify(raw, SpindleDriftSettings(beams=beams, compensate_frame=False))
+        for beams in ("raw", "nominal")
+    }
     miss = {b: np.abs(np.asarray(e.em.twist())[:, SEEN] - truth_of(machine, e)) for b, e in found.items()}
     sigma = {b: np.sqrt(np.diagonal(e["covariance"].values, axis1=1, axis2=2))[:, SEEN] for b, e in found.items()}
     assert miss["nominal"][-1, :2].max() > 3 * miss["raw"][-1, :2].max()
@@ -96,7 +99,7 @@ def test_ec_is_unknown_and_never_zero(machine, method):
 def test_the_functional_point_may_be_chosen_and_only_moves_the_errors(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
     at_end = method.identify(raw)
-    higher = method.identify(raw, Settings(functional_point=(0.0, 0.0, 0.08)))
+    higher = method.identify(raw, SpindleDriftSettings(functional_point=(0.0, 0.0, 0.08)))
     moved = at_end.em.at([0.0, 0.0, 0.08])
     for name in ("EX", "EY", "EZ", "EA", "EB"):
         np.testing.assert_allclose(higher[name], moved[name], rtol=0, atol=1e-10)
@@ -137,7 +140,7 @@ def test_more_noise_than_stated_is_reported_and_increases_the_uncertainty(machin
     raw = simulation.raw_drift(machine, t, seed=6)
     noisy = raw.copy(deep=True)
     noisy["distance_noise"] = raw["distance_noise"] / 3
-    auto, stated = method.identify(noisy), method.identify(noisy, Settings(noise="stated"))
+    auto, stated = method.identify(noisy), method.identify(noisy, SpindleDriftSettings(noise="stated"))
     honest = method.identify(raw)
     sigma = [np.sqrt(e["covariance"].sel(dof="EX", dof_="EX").values[-1]) for e in (auto, stated, honest)]
     assert sigma[0] == pytest.approx(sigma[2], rel=0.15)  # 400 differences: 6 %, and two channels
@@ -148,7 +151,7 @@ def test_more_noise_than_stated_is_reported_and_increases_the_uncertainty(machin
 
 def test_an_uncertainty_of_the_radius_that_is_not_stated_is_noted(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
-    assumed, stated = method.identify(raw), method.identify(raw, Settings(bar_radius_uncertainty="1 um"))
+    assumed, stated = method.identify(raw), method.identify(raw, SpindleDriftSettings(bar_radius_uncertainty="1 um"))
     note = "Assumed: no uncertainty of the radius of the bar (bar_radius_uncertainty = 0)."
     assert note in assumed.attrs["notes"]
     assert not any("radius of the bar" in each for each in stated.attrs["notes"])
@@ -174,7 +177,7 @@ def test_expansion_of_the_frame_is_corrected_by_its_temperature(machine, method)
     raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
     truth = np.asarray(machine.truth_spindle(t, [0, 0, 0]).em.twist())
     truth = truth - truth[0]
-    with_it, without = method.identify(raw), method.identify(raw, Settings(compensate_frame=False))
+    with_it, without = method.identify(raw), method.identify(raw, SpindleDriftSettings(compensate_frame=False))
     miss = [np.abs(np.asarray(e.em.twist()) - truth)[-1, :3] for e in (with_it, without)]
     sigma = np.sqrt(np.diagonal(with_it["covariance"].values[-1]))[:3]
     assert (miss[1] > 0.5e-6).all()  # 1.3 to 2.4 um/K over about a kelvin
@@ -194,7 +197,7 @@ def test_record_that_starts_with_the_spindle_has_its_reference_after_spin_up(mac
     assert np.isnan(errors["EX"].values[:2]).all()
     assert errors["time"].values[2] == pytest.approx(0.0)
     assert abs(errors["EX"].values[2]) < 1e-15
-    run_out = method.identify(raw, Settings(reference_time=0.0))
+    run_out = method.identify(raw, SpindleDriftSettings(reference_time=0.0))
     noise = 0.3e-6 / np.sqrt(rate / 2) * np.sqrt(2)
     assert np.abs(errors["EX"].values[3:]).max() < 4 * noise
     # With the first half second as reference, its run-out is in every later value.
@@ -245,7 +248,7 @@ def test_wrong_inputs_are_refused_with_a_helpful_message(machine, method, name, 
 
 def test_missing_nominal_beams_are_reported(machine, method):
     with pytest.raises(MethodError, match="nominal_origin"):
-        method.identify(spoilt(machine, ""), Settings(beams="nominal"))
+        method.identify(spoilt(machine, ""), SpindleDriftSettings(beams="nominal"))
 
 
 def test_plan_predicts_the_uncertainty_on_the_virtual_machine(machine, method):
@@ -264,7 +267,7 @@ def test_plan_predicts_the_uncertainty_on_the_virtual_machine(machine, method):
 def test_the_live_view_ends_where_the_identification_does(machine, method):
     t = np.arange(0, 600.0, 0.5)
     raw = simulation.raw_drift(machine, t, seed=9)
-    follow = method.follow(Settings(spin_up=0.0))
+    follow = method.follow(SpindleDriftSettings(spin_up=0.0))
     for begin in range(0, t.size, 70):
         text = follow(raw.isel(time=slice(begin, begin + 70)))
     last = np.asarray(method.identify(raw).em.at([0, 0, 0]).em.twist())[-1]
@@ -282,7 +285,7 @@ def test_run_out_after_a_stop_is_part_of_the_uncertainty(method):
     raw = simulation.raw_drift(machine, np.arange(n) / rate, seed=0, averaged=1)
     raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
     raw["spindle_speed"] = ("time", np.where(np.arange(n) / rate < 8.0, 15000.0, 0.0))
-    errors = method.identify(raw, Settings(compensate_frame=False))
+    errors = method.identify(raw, SpindleDriftSettings(compensate_frame=False))
     u = np.sqrt(errors["covariance"].sel(dof="EX", dof_="EX").values)
     time = errors["time"].values + errors.attrs["reference_time"]
     unknown = np.isnan(errors["EX"].values)
@@ -309,7 +312,7 @@ def test_each_rest_is_an_independent_draw_and_a_resting_reference_affects_all_ot
     raw = simulation.raw_drift(machine, clock, seed=0, averaged=1)
     raw["distance"] = (("channel", "time"), machine.distances(0, n, rate))
     raw["spindle_speed"] = ("time", np.where((clock < 6.0) | (clock >= 12.0), 0.0, -15000.0))
-    errors = method.identify(raw, Settings(compensate_frame=False))
+    errors = method.identify(raw, SpindleDriftSettings(compensate_frame=False))
     time = errors["time"].values + errors.attrs["reference_time"]
     u = np.sqrt(errors["covariance"].sel(dof="EX", dof_="EX").values)
     first, running, last = (time > 2) & (time < 5.5), (time > 8) & (time < 11.5), time > 14
@@ -330,7 +333,7 @@ def test_errors_of_the_smoothed_frame_temperature_are_correlated(machine, method
     raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
     warm = raw["temperature"].sel(sensor="frame").values.copy()
     column = list(raw["sensor"].values).index("frame")
-    settings = Settings(frame_expansion_uncertainty=0.0, frame_smoothing=60.0)
+    settings = SpindleDriftSettings(frame_expansion_uncertainty=0.0, frame_smoothing=60.0)
     for seed in range(40):
         raw["temperature"][:, column] = warm + np.random.default_rng(seed).normal(0, 0.03, t.size)
         change = method.identify(raw, settings).em.combine(weights, dim="time")
@@ -352,7 +355,7 @@ def test_whole_curve_agrees_with_the_truth_with_a_noisy_frame_temperature(method
         raw["frame_expansion"] = (("channel", "direction"), machine.frame.expansion)
         column = list(raw["sensor"].values).index("frame")
         raw["temperature"][:, column] += np.random.default_rng(seed).normal(0, 0.02, t.size)
-        errors = method.identify(raw, Settings(noise="stated"))
+        errors = method.identify(raw, SpindleDriftSettings(noise="stated"))
         truth = np.asarray(machine.truth_spindle(t, errors.attrs["functional_point"]).em.twist())
         influence = errors["influence"].transpose("source", "time", "dof").values[..., SEEN]
         own = errors["covariance"].values[:, SEEN, SEEN] - np.einsum("sti,stj->tij", influence, influence)
@@ -394,7 +397,7 @@ def test_equal_levels_are_refused(machine, method):
 def test_record_of_one_mean_is_refused(machine, method):
     raw = simulation.raw_drift(machine, np.arange(0, 2, 1 / 500), seed=0)
     with pytest.raises(MethodError, match=r"gives 1 mean of 1\.5 s"):
-        method.identify(raw, Settings(average=1.5))
+        method.identify(raw, SpindleDriftSettings(average=1.5))
 
 
 def test_stated_noise_of_zero_is_replaced_by_the_observed_noise(machine, method):

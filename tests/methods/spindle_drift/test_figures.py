@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings
 from errormotion.methods.spindle_drift.simulation import simulate
 
-DRIFT = Settings(duration=6000.0)
+DRIFT = SpindleDriftSettings(duration=6000.0)
 
 
 @pytest.fixture(scope="module")
 def drift():
-    return SpindleDrift().identify(simulate(DRIFT, 3)[0], Settings(compensate_frame=False))
+    return SpindleDrift().identify(simulate(DRIFT, 3)[0], SpindleDriftSettings(compensate_frame=False))
 
 
 def test_a_drift_states_its_last_errors_and_its_iso_ranges(drift):
@@ -39,14 +39,16 @@ def test_an_iso_range_states_the_effect_of_each_source(drift):
 
 
 def test_a_short_record_states_the_range_to_the_end_of_running():
-    short = SpindleDrift().identify(simulate(Settings(duration=600.0), 3)[0], Settings(compensate_frame=False))
+    short = SpindleDrift().identify(
+        simulate(SpindleDriftSettings(duration=600.0), 3)[0], SpindleDriftSettings(compensate_frame=False)
+    )
     names = [figure.name for figure in SpindleDrift.figures(short)]
     assert "d(Z) to the end of running, range (ISO 230-3)" in names
     assert not any("60 min" in name for name in names)
 
 
 def test_detected_beams_state_their_errors_and_a_plan_states_none():
-    settings = Settings(procedure="beam_detection")
+    settings = SpindleDriftSettings(procedure="beam_detection")
     beams = SpindleDrift().identify(simulate(settings, 3)[0], settings)
     figures = SpindleDrift.figures(beams)
     known = int(np.isfinite([beams[str(name)].values for name in beams["dof"].values]).sum())

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings, simulation
 from errormotion.methods.spindle_drift.acquisition.given_beams import REQUIRED, given_beams
 from errormotion.twin import VirtualMachine
 
@@ -14,7 +14,9 @@ CHANNELS = ("X1", "X2", "Y1", "Y2", "Z")
 
 @pytest.fixture(scope="module")
 def detected():
-    return SpindleDrift().identify(simulation.raw_beam_detection(VirtualMachine("cframe", seed=2), seed=5), Settings())
+    return SpindleDrift().identify(
+        simulation.raw_beam_detection(VirtualMachine("cframe", seed=2), seed=5), SpindleDriftSettings()
+    )
 
 
 def alone(beams, channel, name="beam"):

@@ -7,7 +7,7 @@ from errormotion.kinematics.twists import move
 from errormotion.methods.spindle_drift import simulation
 from errormotion.methods.spindle_drift.identification.averaging import Averager, join
 from errormotion.methods.spindle_drift.method import SpindleDrift
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 from errormotion.twin import VirtualMachine
 from errormotion.twin.schedule import Event
 
@@ -38,7 +38,7 @@ def largest_deviation(change, seed):
     raw = simulation.raw_drift(machine, t, seed=seed, warm_up=False, radius_error=False)
     values = change(raw["distance"].transpose("channel", "time").values.copy())
     raw["distance"] = (("channel", "time"), values, raw["distance"].attrs)
-    errors = SpindleDrift().identify(raw, Settings(average=AVERAGE, spin_up=0.0))
+    errors = SpindleDrift().identify(raw, SpindleDriftSettings(average=AVERAGE, spin_up=0.0))
     zero = float(errors.attrs["reference_time"])
     shift = np.asarray(errors.attrs["functional_point"]) - machine.spindle_functional_point
     truth = machine.spindle_twist(errors["time"].values + zero) - machine.spindle_twist(np.array([zero]))

@@ -8,7 +8,7 @@ import pytest
 from errormotion.errors import MethodError
 from errormotion.estimation.derivatives import along, by_rows
 from errormotion.instruments.spindle_frame.settings import FrameSettings
-from errormotion.methods.spindle_drift import Settings, SpindleDrift, simulation
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings, simulation
 from errormotion.methods.spindle_drift.model import observe
 from errormotion.montecarlo.trials import redrawing_of, trial
 from errormotion.twin import Event, VirtualMachine
@@ -37,7 +37,7 @@ def warming(machine):
 
 def test_analytic_derivatives_are_those_of_differences(warming):
     problem = observe(
-        warming, Settings(bar_radius_uncertainty=1e-6, gain_uncertainty=1e-3, frame_smoothing=60.0)
+        warming, SpindleDriftSettings(bar_radius_uncertainty=1e-6, gain_uncertainty=1e-3, frame_smoothing=60.0)
     ).problem
     values = [*problem.start.tables, *problem.constant_tables(problem.start)]
     rows = [table.rows(value) for table, value in zip(problem.tables, values, strict=True)]
@@ -58,7 +58,7 @@ def test_analytic_derivatives_are_those_of_differences(warming):
 def test_one_draw_of_every_constant_changes_the_errors_as_its_influence_states(warming):
     """Against the identification of changed raw data: beams, radius and expansion of the frame, one at a time."""
     method = SpindleDrift()
-    settings = Settings(bar_radius_uncertainty=1e-6, functional_point=(0.0, 0.0, 0.0), noise="stated")
+    settings = SpindleDriftSettings(bar_radius_uncertainty=1e-6, functional_point=(0.0, 0.0, 0.0), noise="stated")
     errors = method.identify(warming, settings)
     effects = errors["influence"].transpose("source", "time", "dof").values
     rows = dict(zip(errors["source"].values.tolist(), effects, strict=True))
@@ -91,14 +91,14 @@ def test_an_unknown_temperature_of_the_frame_in_the_reference_state_is_reported(
     warming["temperature"][0] = np.nan
     with pytest.raises(MethodError, match=r"temperature of the frame \(frame\) is unknown in the reference state"):
         SpindleDrift().identify(warming)
-    SpindleDrift().identify(warming, Settings(compensate_frame=False))
-    SpindleDrift().identify(warming, Settings(reference_time=100.0))
+    SpindleDrift().identify(warming, SpindleDriftSettings(compensate_frame=False))
+    SpindleDrift().identify(warming, SpindleDriftSettings(reference_time=100.0))
 
 
 def test_readings_without_noise_have_no_infinite_weight(machine):
     raw = simulation.raw_drift(machine, TIMES[:10], seed=1)
     raw["distance_noise"] = 0.0
-    errors = SpindleDrift().identify(raw, Settings(noise="stated"))
+    errors = SpindleDrift().identify(raw, SpindleDriftSettings(noise="stated"))
     u = np.sqrt(errors["covariance"].sel(dof="EX", dof_="EX").values)
     assert np.isfinite(errors["EX"].values).all()
     assert u.max() < 1e-8  # the unknown rotation about the axis remains
@@ -110,14 +110,16 @@ def test_precise_readings_far_from_the_origin_of_the_machine_are_solved(machine,
     raw = simulation.raw_drift(machine, np.linspace(0.0, 600.0, 2000), seed=1, averaged=200_000_000, warm_up=False)
     raw["beam_origin"] = raw["beam_origin"] + shift
     raw["level"] = raw["level"] + shift
-    errors = SpindleDrift().identify(raw, Settings(noise="stated"))
+    errors = SpindleDrift().identify(raw, SpindleDriftSettings(noise="stated"))
     assert np.isfinite(errors["EX"].values).all()
 
 
 def test_errors_within_a_reference_state_of_several_means_have_their_spread(warming):
     """By draws: each mean shares its noise with the reference state, and the temperature of the frame differs."""
     method = SpindleDrift()
-    settings = Settings(reference_time=0.0, reference_average=100.0, noise="stated", functional_point=(0.0, 0.0, 0.0))
+    settings = SpindleDriftSettings(
+        reference_time=0.0, reference_average=100.0, noise="stated", functional_point=(0.0, 0.0, 0.0)
+    )
     errors = method.identify(warming, settings)
     redrawing = redrawing_of(method, warming, settings, errors)
     draws = [trial(method, redrawing, np.random.SeedSequence(k)).em.twist().values[:11, :5] for k in range(150)]
@@ -139,11 +141,11 @@ EXPANDING = {"frame_expansion": (2.1e-6, 2.4e-6, 1.3e-6)}
 @pytest.mark.parametrize(
     "settings",
     [
-        Settings(),
-        Settings(layout=EXPANDING, bar_radius_uncertainty=1e-6),
-        Settings(layout=EXPANDING, reference_time=60.0, reference_average=30.0),
-        Settings(beams="nominal"),
-        Settings(procedure="beam_detection"),
+        SpindleDriftSettings(),
+        SpindleDriftSettings(layout=EXPANDING, bar_radius_uncertainty=1e-6),
+        SpindleDriftSettings(layout=EXPANDING, reference_time=60.0, reference_average=30.0),
+        SpindleDriftSettings(beams="nominal"),
+        SpindleDriftSettings(procedure="beam_detection"),
     ],
     ids=["plain", "expanding", "averaged", "nominal", "beams"],
 )
@@ -159,7 +161,7 @@ def test_plan_is_the_identification_of_the_expected_data(settings):
 def test_plan_of_a_frame_that_expands_states_the_largest_part_of_the_uncertainty():
     """A tenth of 2.1 um: without it, the plan of EX is 5 nm."""
     u = [
-        np.sqrt(SpindleDrift().plan(Settings(layout=layout))["covariance"].values[-1, 0, 0])
+        np.sqrt(SpindleDrift().plan(SpindleDriftSettings(layout=layout))["covariance"].values[-1, 0, 0])
         for layout in ({}, EXPANDING)
     ]
     assert u[0] < 10e-9
@@ -167,7 +169,7 @@ def test_plan_of_a_frame_that_expands_states_the_largest_part_of_the_uncertainty
 
 
 def test_a_longer_reference_state_decreases_its_planned_part():
-    plans = [SpindleDrift().plan(Settings(reference_average=length)) for length in (0.5, 50.0)]
+    plans = [SpindleDrift().plan(SpindleDriftSettings(reference_average=length)) for length in (0.5, 50.0)]
     parts = []
     for plan in plans:
         rows = plan["influence"].values[plan["source_group"].values == "reference state"]
@@ -178,20 +180,26 @@ def test_a_longer_reference_state_decreases_its_planned_part():
 def test_the_plan_of_a_campaign_has_the_frame_of_the_bench():
     method = SpindleDrift()
     frame = FrameSettings(expansion=(2.1e-6, 2.4e-6, 1.3e-6), bar_radius=6e-3)
-    warm = method.planning_settings(Settings(), {"spindle_frame": frame, "thermometer": object()}).layout
+    warm = method.planning_settings(SpindleDriftSettings(), {"spindle_frame": frame, "thermometer": object()}).layout
     assert warm.frame_expansion == frame.expansion
     assert (warm.bar_radius, warm.levels, warm.noise) == (6e-3, frame.levels, frame.noise)
     # Without a thermometer nothing is corrected; what the campaign states is kept.
-    assert method.planning_settings(Settings(), {"spindle_frame": frame}).layout.frame_expansion == (0.0, 0.0, 0.0)
-    stated = method.planning_settings(Settings(layout={"bar_radius": 4e-3}), {"spindle_frame": frame}).layout
+    assert method.planning_settings(SpindleDriftSettings(), {"spindle_frame": frame}).layout.frame_expansion == (
+        0.0,
+        0.0,
+        0.0,
+    )
+    stated = method.planning_settings(
+        SpindleDriftSettings(layout={"bar_radius": 4e-3}), {"spindle_frame": frame}
+    ).layout
     assert stated.bar_radius == 4e-3
-    assert method.planning_settings(Settings(), {}).layout == Settings().layout
+    assert method.planning_settings(SpindleDriftSettings(), {}).layout == SpindleDriftSettings().layout
 
 
 def test_a_drift_has_the_relative_uncertainty_of_the_gain(warming):
     """EZ follows from one sensor that looks along the axis; two records with the same sensors share their gains."""
     warming.attrs["certificates"] = json.dumps({"sensor": "S-5"})
-    settings = Settings(gain_uncertainty=2e-3, compensate_frame=False, functional_point=(0.0, 0.0, 0.0))
+    settings = SpindleDriftSettings(gain_uncertainty=2e-3, compensate_frame=False, functional_point=(0.0, 0.0, 0.0))
     errors = SpindleDrift().identify(warming, settings)
     row = errors["influence"].sel(source="gain Z", dof="EZ").values
     # But for the tilt over the distance of the beam from the axis: some nanometres of some micrometres.

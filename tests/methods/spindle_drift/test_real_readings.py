@@ -5,12 +5,12 @@ import pytest
 import xarray as xr
 
 from errormotion.kinematics.iso import DOF
-from errormotion.methods.spindle_drift import Settings, SpindleDrift
+from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings
 from errormotion.methods.spindle_drift.simulation import raw_drift, simulate
 from errormotion.twin import Event, VirtualMachine
 
-SETTINGS = Settings(functional_point=(0.0, 0.0, 0.0))
-MEASURED = Settings(duration=6000.0)
+SETTINGS = SpindleDriftSettings(functional_point=(0.0, 0.0, 0.0))
+MEASURED = SpindleDriftSettings(duration=6000.0)
 NOISE = 3e-9
 
 

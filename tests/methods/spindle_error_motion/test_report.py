@@ -6,7 +6,7 @@ from html import unescape
 import pytest
 
 from errormotion.datasets.results.merit import figures_of
-from errormotion.methods.spindle_error_motion import Settings, SpindleErrorMotion
+from errormotion.methods.spindle_error_motion import SpindleErrorMotion, SpindleErrorMotionSettings
 from errormotion.report import write_report
 from errormotion.report.text import rounded
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("translated")
 @pytest.fixture(scope="module")
 def measured():
     """Return the result of a test with notes: nothing is known about the artefact, and readings are missing."""
-    settings = Settings(turns=16, sample_rate=3000.0, places=48, radial_limit=0.3e-6)
+    settings = SpindleErrorMotionSettings(turns=16, sample_rate=3000.0, places=48, radial_limit=0.3e-6)
     raw, _ = SpindleErrorMotion().simulate(settings, seed=1)
     raw["displacement"][77, 1] = float("nan")
     return SpindleErrorMotion().identify(raw.drop_vars(["roundness", "position_uncertainty"]), settings)

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from errormotion.errors import MethodError
-from errormotion.methods.spindle_error_motion import Settings, SpindleErrorMotion, synchronous, turning
+from errormotion.methods.spindle_error_motion import (
+    SpindleErrorMotion,
+    SpindleErrorMotionSettings,
+    synchronous,
+    turning,
+)
 
 TAU = 2 * np.pi
 A, B, C = 120e-9, 80e-9, 60e-9
@@ -13,7 +18,7 @@ EXACT = 0.4e-9
 
 
 def evaluated(raw, **settings):
-    errors = SpindleErrorMotion().identify(raw, Settings(**settings))
+    errors = SpindleErrorMotion().identify(raw, SpindleErrorMotionSettings(**settings))
     return errors, {each.name: each.value for each in SpindleErrorMotion.figures(errors)}
 
 

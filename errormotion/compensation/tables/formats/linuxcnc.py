@@ -26,7 +26,7 @@ DECIMALS = 6
 """Of a number in mm: 1 nm."""
 
 
-class LinuxCNCSettings(TableSettings):
+class LinuxCNCTableSettings(TableSettings):
     """Settings of the format."""
 
     type: Literal[0, 1] = Field(default=1, description="COMP_FILE_TYPE: 1 = trims, 0 = reached positions")
@@ -42,9 +42,9 @@ class LinuxCNCTable:
         "LinuxCNC 2.9: src/emc/motion/usrmotintf.cc (usrmotLoadComp), control.c (compute_screw_comp), motion.h; tried "
         "on LinuxCNC 2.9"
     )
-    Settings: ClassVar[type[TableSettings]] = LinuxCNCSettings
+    Settings: ClassVar[type[TableSettings]] = LinuxCNCTableSettings
 
-    def write(self, table: AxisTable, settings: LinuxCNCSettings) -> Written:
+    def write(self, table: AxisTable, settings: LinuxCNCTableSettings) -> Written:
         """Return the file.
 
         Raises

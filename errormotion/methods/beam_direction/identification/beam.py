@@ -27,7 +27,7 @@ from errormotion.methods.beam_direction.identification.receiver import check_rec
 from errormotion.methods.beam_direction.identification.sensor import Sensor
 
 if TYPE_CHECKING:
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 FALSE_ALARM = 1e-3
 """Probability that correct known points of planes are reported as contradictory."""
@@ -39,13 +39,13 @@ _PARAMETERS = ["px", "py", "pz", "ux", "uy", "uz"]
 _LABELS = {"direction": list("xyz"), "direction_": list("xyz"), "p": _PARAMETERS, "p_": _PARAMETERS}
 
 
-def observe(raw: xr.Dataset, settings: Settings, sensor: Sensor | None) -> Observed:
+def observe(raw: xr.Dataset, settings: BeamDirectionSettings, sensor: Sensor | None) -> Observed:
     """Return readings on planes as a model of the beam; see `errormotion.methods.beam_direction.identification.model`.
 
     Parameters
     ----------
     raw : Dataset
-    settings : Settings
+    settings : BeamDirectionSettings
     sensor : Sensor or None
         For the compensation.
 
@@ -192,7 +192,7 @@ class _Result:
     """What follows from a solution."""
 
     raw: xr.Dataset
-    settings: Settings
+    settings: BeamDirectionSettings
     data: Readings
     beam: Beam
     uncompensated: Array

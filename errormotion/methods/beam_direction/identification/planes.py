@@ -26,7 +26,7 @@ from errormotion.measurement.observed import Observed, Solved
 
 if TYPE_CHECKING:
     from errormotion.methods.beam_direction.identification.reading import Readings
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 T = TypeVar("T")
 UNKNOWNS = 4
@@ -81,7 +81,7 @@ class Planes:
         return self.value[:, :3]
 
 
-def fit_planes(data: Readings, settings: Settings, notes: list[str]) -> Planes:
+def fit_planes(data: Readings, settings: BeamDirectionSettings, notes: list[str]) -> Planes:
     """Return the planes through the readings without outliers; remarks are appended to ``notes``.
 
     Raises
@@ -120,7 +120,7 @@ def fit_planes(data: Readings, settings: Settings, notes: list[str]) -> Planes:
     return Planes(data.names, centre, value, covariance, noise, tuple(doubts), solved)
 
 
-def _observed(data: Readings, readings: Array, design: Array, settings: Settings) -> Observed:
+def _observed(data: Readings, readings: Array, design: Array, settings: BeamDirectionSettings) -> Observed:
     """Return the readings as a model of planes: one vector reading each with speckle, else independent readings."""
     k, n = readings.shape
     series, order = np.indices((k, n)).reshape(2, -1)

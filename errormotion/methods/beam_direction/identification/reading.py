@@ -14,7 +14,7 @@ from errormotion.errors import MethodError
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 
 MAX_MISSING = 0.3
@@ -73,7 +73,7 @@ class Readings:
         return self.speckle > 0 and self.speckle_length > 0
 
 
-def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
+def read(raw: xr.Dataset, settings: BeamDirectionSettings, notes: list[str]) -> Readings:
     """Return the readings of a raw dataset; remarks are appended to ``notes``.
 
     Raises

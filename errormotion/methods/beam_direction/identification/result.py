@@ -17,10 +17,10 @@ from errormotion.methods.beam_direction.identification.sensor import Sensor
 if TYPE_CHECKING:
     from errormotion.measurement.method import ModelMethod
     from errormotion.measurement.observed import Observed
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 
-def identify(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
+def identify(method: ModelMethod, raw: xr.Dataset, settings: BeamDirectionSettings) -> xr.Dataset:
     """Return an error dataset of component ``beam``: the beam minus the nominal beam.
 
     Raises
@@ -42,7 +42,7 @@ def identify(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dat
     return dataset(method, solved, raw, method.info, origin)
 
 
-def _with_bar(observed: Observed, raw: xr.Dataset, sensor: Sensor | None, settings: Settings) -> Observed:
+def _with_bar(observed: Observed, raw: xr.Dataset, sensor: Sensor | None, settings: BeamDirectionSettings) -> Observed:
     """Return what was observed with the check bar, measured with the beam."""
     notes, extras = list(observed.notes), dict(observed.extras)
     p, u = (extras[name].values[0] for name in ("beam_origin", "beam_direction"))

@@ -16,7 +16,7 @@ from errormotion.methods.beam_direction.identification.reading import triangulat
 if TYPE_CHECKING:
     import xarray as xr
 
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 CALIBRATION = "inclination calibration"
 SAME_TILT = 0.01
@@ -48,7 +48,7 @@ class Sensor:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, raw: xr.Dataset, settings: Settings) -> Sensor | None:
+    def of(cls, raw: xr.Dataset, settings: BeamDirectionSettings) -> Sensor | None:
         """Return the sensor for the compensation; None without compensation.
 
         Raises

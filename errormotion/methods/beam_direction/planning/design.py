@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 
 MIN_READINGS = 3
@@ -97,7 +97,9 @@ class Limits:
 
 
 def limits_of(
-    settings: Settings, sensor_range: float | None = None, slope_uncertainty: Callable[[Array], Array] | None = None
+    settings: BeamDirectionSettings,
+    sensor_range: float | None = None,
+    slope_uncertainty: Callable[[Array], Array] | None = None,
 ) -> Limits:
     """Return the limits of the settings; ``sensor_range`` (m) of the sensor replaces that of the settings."""
     p = settings.layout

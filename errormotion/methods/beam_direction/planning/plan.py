@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from errormotion.measurement.method import ModelMethod
     from errormotion.methods.beam_direction.planning.design import Design, Limits
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 
 PUBLISHED = ((np.radians(20.0), 0.0), (np.radians(20.0), np.radians(90.0)))
@@ -47,7 +47,7 @@ SETUPS = ("two planes, equal strokes", "as set", "two planes, best", "best")
 _M, _1 = {"units": "m"}, {"units": "1"}
 
 
-def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
+def plan(method: ModelMethod, settings: BeamDirectionSettings) -> xr.Dataset:
     """Return an error dataset of zeros with the expected covariance of the set-up in the settings.
 
     Additional variables over ``setup``: the larger expected uncertainty of the two angles of the beam,
@@ -60,7 +60,7 @@ def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
     Parameters
     ----------
     method : ModelMethod
-    settings : Settings
+    settings : BeamDirectionSettings
 
     Raises
     ------
@@ -98,7 +98,7 @@ def plan(method: ModelMethod, settings: Settings) -> xr.Dataset:
     return dataset(method, replace(own, observed=observed), expected(settings), method.info, origin, planned=True)
 
 
-def solved_setup(setup: Design, settings: Settings) -> Solved:
+def solved_setup(setup: Design, settings: BeamDirectionSettings) -> Solved:
     """Return the solution of the readings that a set-up is expected to give.
 
     Tilts that the calibration does not cover have its uncertainty there, which is large.
@@ -108,7 +108,7 @@ def solved_setup(setup: Design, settings: Settings) -> Solved:
     return solve(as_expected(observed))
 
 
-def expected(settings: Settings, setup: Design | None = None) -> xr.Dataset:
+def expected(settings: BeamDirectionSettings, setup: Design | None = None) -> xr.Dataset:
     """Return the readings, without noise, of a nominal beam on the planes of a set-up; by default of the settings.
 
     With a compensation they have the inclination error of its calibration.
@@ -147,7 +147,7 @@ def expected(settings: Settings, setup: Design | None = None) -> xr.Dataset:
     return raw.assign(distance=(("plane", "reading"), m + (distance - m) * (1 + slope)[:, None], _M))
 
 
-def stated_setup(settings: Settings, limits: Limits) -> Design:
+def stated_setup(settings: BeamDirectionSettings, limits: Limits) -> Design:
     """Return the set-up of the settings, with the positions of a path if one is given."""
     p, planes = settings.layout, _angles(settings)
     design.check_numbers(len(planes), limits)
@@ -214,7 +214,7 @@ class RemainingError:
         return look_up
 
 
-def _remaining(settings: Settings) -> RemainingError | None:
+def _remaining(settings: BeamDirectionSettings) -> RemainingError | None:
     """Return the remaining error with the calibration of the settings; None without calibration."""
     if settings.compensation is not None and settings.layout.triangulation_normal is None:
         raise MethodError(f"layout.triangulation_normal: {NORMAL_NEEDED}", code="beam.triangulation_normal.missing")
@@ -223,7 +223,7 @@ def _remaining(settings: Settings) -> RemainingError | None:
     return RemainingError(sensor, raw["nominal_direction"].values, settings.extrapolate) if sensor else None
 
 
-def _angles(settings: Settings) -> Array:
+def _angles(settings: BeamDirectionSettings) -> Array:
     return np.array([(face.inclination, face.rotation) for face in settings.planes])
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from errormotion.methods.crossbeam_scan.acquisition.moving import Mover
     from errormotion.methods.crossbeam_scan.acquisition.programs import Program
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 
 BLOCK_LINES = 64
@@ -80,7 +80,7 @@ class Lines:
 
 
 def listen(
-    profiler: Any, mover: Mover, program: Program, settings: Settings, low: float, high: float
+    profiler: Any, mover: Mover, program: Program, settings: CrossbeamScanSettings, low: float, high: float
 ) -> Generator[Lines]:
     """Start a pass and yield its lines until the axis is past its last scan.
 
@@ -90,7 +90,7 @@ def listen(
     mover : Mover
     program : Program
         The pass.
-    settings : Settings
+    settings : CrossbeamScanSettings
     low, high : float
         Ends of the motion with the measuring feed, m; ``margin`` after the last scan is included.
 
@@ -127,7 +127,7 @@ def listen(
             raise BrokenPassError(str(error), last) from error
 
 
-def _located(block: Any, middle: float, now: float, settings: Settings) -> Lines:
+def _located(block: Any, middle: float, now: float, settings: CrossbeamScanSettings) -> Lines:
     encoder = unwrapped(block.encoder, middle)
     position = settings.encoder_zero + settings.encoder_pitch * encoder
     known = filled(position)

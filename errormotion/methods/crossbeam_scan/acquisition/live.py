@@ -19,7 +19,7 @@ from errormotion.methods.crossbeam_scan.identification.registration import Block
 
 if TYPE_CHECKING:
     from errormotion.arrays import Array
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ class LiveScans:
     so that the measurement is never delayed.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: CrossbeamScanSettings) -> None:
         self._settings = settings
         self._cold: dict[int, BlockMap] = {}
         self._parts: list[xr.Dataset] = []

@@ -25,7 +25,7 @@ from errormotion.methods.crossbeam_scan.schema import SCHEMA
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
     from errormotion.plugins import Bench
 
     Heights = NDArray[np.float32]
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def record_pocket(bench: Bench, settings: CrossbeamScanSettings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield scans of a pocket, one chunk along ``scan`` for each lift of the spindle.
 
     A pass that fails or was interrupted is repeated.
@@ -42,7 +42,7 @@ def record_pocket(bench: Bench, settings: Settings, done: xr.Dataset | None) -> 
     ----------
     bench : Bench
         With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
-    settings : Settings
+    settings : CrossbeamScanSettings
     done : Dataset, optional
         The complete scans of an interrupted run. A virtual machine that was restarted repeats them, without their data.
 
@@ -93,7 +93,7 @@ def require_streaming(profiler: Any) -> None:
         )
 
 
-def _static(bench: Bench, settings: Settings, programs: dict[str, str]) -> xr.Dataset:
+def _static(bench: Bench, settings: CrossbeamScanSettings, programs: dict[str, str]) -> xr.Dataset:
     m = {"units": "m"}
     return xr.Dataset(
         {
@@ -112,7 +112,7 @@ def _static(bench: Bench, settings: Settings, programs: dict[str, str]) -> xr.Da
 
 
 def _scan(
-    profiler: Any, move: Mover, program: Program, settings: Settings
+    profiler: Any, move: Mover, program: Program, settings: CrossbeamScanSettings
 ) -> tuple[Array, Heights, Array, dict[str, Any]]:
     """Return y (profile,), heights (profile, point) and x (point,) of a pass, and counts of losses; with retries."""
     for attempt in range(1, FAILURE_LIMIT + 1):
@@ -130,7 +130,7 @@ def _scan(
     raise InstrumentError(f"{program.name} was not run", code="scan.program.not_run")
 
 
-def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> Iterator[Lines]:
+def _pass(profiler: Any, move: Mover, program: Program, settings: CrossbeamScanSettings) -> Iterator[Lines]:
     """Yield the lines over the pocket."""
     low, high = program.reach()
     reach = settings.pocket_scan_length / 2 + settings.line_pitch
@@ -142,7 +142,7 @@ def _pass(profiler: Any, move: Mover, program: Program, settings: Settings) -> I
                 yield part
 
 
-def _cut(parts: list[Lines], settings: Settings) -> tuple[Array, Heights, Array, dict[str, Any]]:
+def _cut(parts: list[Lines], settings: CrossbeamScanSettings) -> tuple[Array, Heights, Array, dict[str, Any]]:
     """Return the lines on an equidistant grid, the same for every scan; positions without a line are NaN."""
     count = int(settings.pocket_scan_length / settings.line_pitch)
     if not parts:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 DWELL = 2.0
 """Dwell before the measuring move, s: the axis comes to rest and the profiler becomes ready."""
@@ -120,7 +120,7 @@ class Program:
             )
 
 
-def measuring_pass(settings: Settings) -> Program:
+def measuring_pass(settings: CrossbeamScanSettings) -> Program:
     """Return the pass over all artefacts in +Y, with the measuring feed only, so that the machine stays cold."""
     low, high = pass_ends(settings)
     count = len(settings.positions)
@@ -130,7 +130,7 @@ def measuring_pass(settings: Settings) -> Program:
     )
 
 
-def pass_ends(settings: Settings) -> tuple[float, float]:
+def pass_ends(settings: CrossbeamScanSettings) -> tuple[float, float]:
     """Return start and end of a measuring pass, m."""
     if not settings.positions:
         raise MethodError(
@@ -142,7 +142,7 @@ def pass_ends(settings: Settings) -> tuple[float, float]:
     return settings.positions[0] - beyond, settings.positions[-1] + beyond
 
 
-def pocket_pass(settings: Settings, number: int) -> Program:
+def pocket_pass(settings: CrossbeamScanSettings, number: int) -> Program:
     """Return the pass over the pocket for one lift of the spindle; ``number`` counts from 1."""
     beyond = settings.pocket_scan_length / 2 + settings.margin
     low, high = settings.pocket_position - beyond, settings.pocket_position + beyond
@@ -155,11 +155,11 @@ def pocket_pass(settings: Settings, number: int) -> Program:
     )
 
 
-def _pass(low: float, high: float, settings: Settings) -> tuple[Move | Dwell, ...]:
+def _pass(low: float, high: float, settings: CrossbeamScanSettings) -> tuple[Move | Dwell, ...]:
     return Move(low, settings.measuring_feed), Dwell(DWELL), Move(high, settings.measuring_feed)
 
 
-def warm_up_piece(settings: Settings, number: int, seconds: float, start: float) -> Program:
+def warm_up_piece(settings: CrossbeamScanSettings, number: int, seconds: float, start: float) -> Program:
     """Return warm-up moves back and forth of a given duration from a start (m); the last stroke is shorter.
 
     Raises
@@ -185,7 +185,7 @@ def warm_up_piece(settings: Settings, number: int, seconds: float, start: float)
     return Program(f"warm_up_{number}.nc", f"warm-up moves, {seconds / MINUTE:.1f} min", tuple(steps))
 
 
-def texts(programs: Sequence[Program], settings: Settings) -> dict[str, str]:
+def texts(programs: Sequence[Program], settings: CrossbeamScanSettings) -> dict[str, str]:
     """Check that all programs stay within the travel; return their texts by file name.
 
     Raises

@@ -12,11 +12,11 @@ from errormotion.errors import MethodError
 
 if TYPE_CHECKING:
     from errormotion.methods.crossbeam_scan.acquisition.schedule import Schedule
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 
 def record_files(
-    profiler: Any, settings: Settings, plan: Schedule, static: xr.Dataset, done: xr.Dataset | None
+    profiler: Any, settings: CrossbeamScanSettings, plan: Schedule, static: xr.Dataset, done: xr.Dataset | None
 ) -> Iterator[xr.Dataset]:
     """Yield the scans of files, one chunk along ``line`` for each.
 
@@ -27,7 +27,7 @@ def record_files(
     Parameters
     ----------
     profiler : ProfileFiles
-    settings : Settings
+    settings : CrossbeamScanSettings
     plan : Schedule
     static : Dataset
         See ``acquisition.static_part``.

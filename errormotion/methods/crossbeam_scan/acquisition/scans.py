@@ -31,7 +31,7 @@ from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors
 from errormotion.methods.crossbeam_scan.schema import SCHEMA
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
     from errormotion.plugins import Bench
 
 
@@ -46,7 +46,7 @@ FAILURE_LIMIT = 3
 
 
 def record_scans(
-    bench: Bench, settings: Settings, pose: xr.Dataset | None, done: xr.Dataset | None
+    bench: Bench, settings: CrossbeamScanSettings, pose: xr.Dataset | None, done: xr.Dataset | None
 ) -> Iterator[xr.Dataset]:
     """Yield the scans as recorded, chunk by chunk along ``line``.
 
@@ -54,7 +54,7 @@ def record_scans(
     ----------
     bench : Bench
         With a ``line_profiler``; a ``controller`` where there is one, else the operator is prompted.
-    settings : Settings
+    settings : CrossbeamScanSettings
     pose : Dataset, optional
         Error dataset of a test that determined the profiler's pose; without it ``settings.profiler_pose`` is used.
     done : Dataset, optional
@@ -79,7 +79,7 @@ def record_scans(
     return _Campaign(profiler, mover(bench), settings, plan, static, done).chunks()
 
 
-def expected_lines(settings: Settings) -> int:
+def expected_lines(settings: CrossbeamScanSettings) -> int:
     """Return the approximate number of lines that a campaign stores: the total of its progress."""
     length = settings.scan_length + 2 * settings.margin
     return (
@@ -89,7 +89,7 @@ def expected_lines(settings: Settings) -> int:
     )
 
 
-def static_part(bench: Bench, settings: Settings, plan: Schedule, pose: xr.Dataset | None) -> xr.Dataset:
+def static_part(bench: Bench, settings: CrossbeamScanSettings, plan: Schedule, pose: xr.Dataset | None) -> xr.Dataset:
     """Return everything of a raw dataset that is known before its first line."""
     m = {"units": "m"}
     matrix, covariance = pose_of(settings, pose)
@@ -116,7 +116,7 @@ def static_part(bench: Bench, settings: Settings, plan: Schedule, pose: xr.Datas
     )
 
 
-def pose_of(settings: Settings, found: xr.Dataset | None) -> tuple[Array, Array]:
+def pose_of(settings: CrossbeamScanSettings, found: xr.Dataset | None) -> tuple[Array, Array]:
     """Return pose (4, 4) of the profiler in the tool frame and its covariance (6, 6), from a test or the settings.
 
     Raises
@@ -143,7 +143,7 @@ class _Campaign:
         self,
         profiler: Any,
         move: Mover,
-        settings: Settings,
+        settings: CrossbeamScanSettings,
         plan: Schedule,
         static: xr.Dataset,
         done: xr.Dataset | None,

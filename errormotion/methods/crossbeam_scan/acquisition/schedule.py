@@ -23,7 +23,7 @@ from errormotion.methods.crossbeam_scan.acquisition.programs import (
 )
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -32,7 +32,7 @@ from errormotion.methods.crossbeam_scan.acquisition.programs import Dwell
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 
 PROGRAM_INTERVAL = 5.0
@@ -110,7 +110,7 @@ class Schedule:
         return json.dumps([item.__dict__ for item in self.items])
 
 
-def schedule(settings: Settings) -> Schedule:
+def schedule(settings: CrossbeamScanSettings) -> Schedule:
     """Return the schedule of a campaign.
 
     Raises
@@ -147,7 +147,7 @@ def schedule(settings: Settings) -> Schedule:
     return Schedule(tuple(items), programs, (*[0.0] * cold, *settings.warm_up))
 
 
-def program_texts(settings: Settings) -> dict[str, str]:
+def program_texts(settings: CrossbeamScanSettings) -> dict[str, str]:
     """Return the NC programs of a test, of scans or of the pocket, by file name.
 
     Raises
@@ -160,7 +160,7 @@ def program_texts(settings: Settings) -> dict[str, str]:
     return texts(list(schedule(settings).programs.values()), settings)
 
 
-def steps(settings: Settings) -> list[Step]:
+def steps(settings: CrossbeamScanSettings) -> list[Step]:
     """Return every step of the axis Y, and of Z where the settings state it, in the order of the programs.
 
     Raises

@@ -29,7 +29,7 @@ from errormotion.estimation.smoothing import ORDER, smooth
 from errormotion.methods.crossbeam_scan.identification.model import Campaign
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 MINIMUM_ARTEFACTS = 4
 """Smallest number of artefacts that can be compared with each other."""
@@ -67,7 +67,7 @@ class ArtefactCheck:
 
 
 def check_artefacts(
-    every: Campaign, settings: Settings, time: Array, cold: list[int], warm: list[int]
+    every: Campaign, settings: CrossbeamScanSettings, time: Array, cold: list[int], warm: list[int]
 ) -> ArtefactCheck:
     """Return which artefacts moved, from the repeated cold scans and from a comparison with their neighbours.
 
@@ -75,7 +75,7 @@ def check_artefacts(
     ----------
     every : Campaign
         Of all cycles.
-    settings : Settings
+    settings : CrossbeamScanSettings
     time : (warm cycle,)
         s, increasing.
     cold, warm : list of int

@@ -24,7 +24,7 @@ from errormotion.methods.crossbeam_scan.identification.registration.freedoms imp
 from errormotion.methods.crossbeam_scan.identification.registration.solver import Problem, State
 
 if TYPE_CHECKING:
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 log = logging.getLogger(__name__)
 
@@ -166,7 +166,9 @@ class Maps:
 QUALITY = ("residual_rms", "noise_found", "jitter_z", "jitter_y", "condition", "points_used", "variance_factor")
 
 
-def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, settings: Settings) -> Registrations:
+def register_all(
+    scans: Scans, cold_cycles: Sequence[int], height_noise: float, settings: CrossbeamScanSettings
+) -> Registrations:
     """Register every scan onto the first usable cold scan of its artefact.
 
     Parameters
@@ -176,7 +178,7 @@ def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, 
         Cycles that may be the reference, in order of preference.
     height_noise : float
         Stated standard deviation of one height, m, for the bound.
-    settings : Settings
+    settings : CrossbeamScanSettings
     """
     found = Registrations.empty(scans.cycles, scans.artefacts)
     for artefact in range(scans.artefacts):
@@ -185,7 +187,12 @@ def register_all(scans: Scans, cold_cycles: Sequence[int], height_noise: float, 
 
 
 def _artefact(
-    scans: Scans, k: int, cold_cycles: Sequence[int], noise: float, settings: Settings, found: Registrations
+    scans: Scans,
+    k: int,
+    cold_cycles: Sequence[int],
+    noise: float,
+    settings: CrossbeamScanSettings,
+    found: Registrations,
 ) -> Maps | None:
     """Register all scans of one artefact; return its maps."""
     order = [*cold_cycles, *(c for c in range(scans.cycles) if c not in cold_cycles)]
@@ -253,7 +260,7 @@ def _prefetched(scans: Scans, cycles: Sequence[int], artefact: int) -> Iterator[
         yield future.result()
 
 
-def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registration:
+def _register(cold: BlockMap, warm: BlockMap, settings: CrossbeamScanSettings) -> Registration:
     extra: dict[str, float] = {}
     if settings.registration == "height_map":
         if settings.strain != "rigid":
@@ -265,7 +272,7 @@ def _register(cold: BlockMap, warm: BlockMap, settings: Settings) -> Registratio
     )  # fmt: skip
 
 
-def estimated(settings: Settings) -> dict[str, float]:
+def estimated(settings: CrossbeamScanSettings) -> dict[str, float]:
     """Return the priors of the strains that are not exact, by their parameter."""
     return {name: sigma for name, sigma in settings.strains().items() if name in STRAINS and sigma > 0}
 

@@ -30,7 +30,7 @@ from errormotion.methods.crossbeam_scan.settings import HEIGHT, STRAIN
 
 if TYPE_CHECKING:
     from errormotion.measurement import ModelMethod
-    from errormotion.methods.crossbeam_scan.settings import Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ DOMINANCE = 10.0
 _STEPS = ["cut scans", "register", "guide", "chain to carriage", "consistency", "smooth"]  # in the provenance
 
 
-def identify_scans(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> xr.Dataset:
+def identify_scans(method: ModelMethod, raw: xr.Dataset, settings: CrossbeamScanSettings) -> xr.Dataset:
     """Return the errors of the axis over time and position.
 
     Parameters
@@ -50,7 +50,7 @@ def identify_scans(method: ModelMethod, raw: xr.Dataset, settings: Settings) -> 
         The plugin.
     raw : Dataset
         Any variant but "profiler pose"; read scan by scan.
-    settings : Settings
+    settings : CrossbeamScanSettings
 
     Raises
     ------
@@ -158,7 +158,7 @@ class Evaluated:
         return {"cold_repeat": (dims, values[some]), "cold_repeat_u": (dims, u[some])}
 
 
-def observe(raw: xr.Dataset, settings: Settings) -> tuple[Observed, Evaluated]:
+def observe(raw: xr.Dataset, settings: CrossbeamScanSettings) -> tuple[Observed, Evaluated]:
     """Return what the raw data of scans mean, and what they say besides.
 
     Raises
@@ -313,7 +313,7 @@ def _planned(raw: xr.Dataset, cycles: int) -> Array | None:
     return np.asarray(raw[name].values, dtype=float)
 
 
-def _strain_notes(settings: Settings) -> list[str]:
+def _strain_notes(settings: CrossbeamScanSettings) -> list[str]:
     """Return notes on scales, expansions and height that are assumed."""
     stated = {
         "scale_uncertainty": settings.scale_uncertainty,

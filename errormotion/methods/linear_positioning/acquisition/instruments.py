@@ -16,7 +16,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, direction_of
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
     from errormotion.plugins import Bench
 
 UNITS = ("m", "m", "m", "rad", "rad", "rad")
@@ -40,7 +40,7 @@ class Reader(Protocol):
         """Return the readings (freedom,), m and rad; ``distance`` (m) is the commanded one from the zero."""
 
 
-def axis_reader(bench: Bench, settings: Settings) -> Reader:
+def axis_reader(bench: Bench, settings: LinearPositioningSettings) -> Reader:
     """Return the reader of the freedoms of an axis.
 
     Raises
@@ -67,7 +67,7 @@ def axis_reader(bench: Bench, settings: Settings) -> Reader:
     raise _missing()
 
 
-def diagonal_reader(bench: Bench, settings: Settings, channel: str, name: str) -> Reader:
+def diagonal_reader(bench: Bench, settings: LinearPositioningSettings, channel: str, name: str) -> Reader:
     """Return the reader of displacements along a diagonal; ``channel`` is that of an interferometer.
 
     Raises

@@ -26,14 +26,14 @@ from errormotion.methods.linear_positioning.schema import APPROACHES, READINGS, 
 from errormotion.plugins.virtual import is_virtual, wait
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
     from errormotion.plugins import Bench
 
 _POLL_INTERVAL = 0.05  # s, real time
 _M = {"units": "m"}
 
 
-def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def measure_axis(bench: Bench, settings: LinearPositioningSettings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield one raw dataset for each run, or for each target of a pendulum cycle.
 
     Parameters
@@ -41,7 +41,7 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
     bench : Bench
         With a ``controller`` (``move_to``, ``state``) and an ``interferometer`` or a ``laser_tracker``; a
         ``thermometer``, where the settings name sensors.
-    settings : Settings
+    settings : LinearPositioningSettings
     done : Dataset, optional
         Data of an interrupted run, which are not measured again. The instrument is then set to zero again. A virtual
         machine that was restarted repeats them, without their data.
@@ -67,7 +67,7 @@ def measure_axis(bench: Bench, settings: Settings, done: xr.Dataset | None) -> I
 class Motion:
     """The control of a bench, with moves that wait for the arrival."""
 
-    def __init__(self, bench: Bench, settings: Settings) -> None:
+    def __init__(self, bench: Bench, settings: LinearPositioningSettings) -> None:
         self.bench, self.settings = bench, settings
         self.control: Any = bench.of_kind("controller") if bench.has_kind("controller") else None
         if not hasattr(self.control, "move_to"):
@@ -125,7 +125,7 @@ class Motion:
 class AxisMeasurement(Motion):
     """Machine and instrument of a bench, for one axis."""
 
-    def __init__(self, bench: Bench, settings: Settings, zero: float | None = None) -> None:
+    def __init__(self, bench: Bench, settings: LinearPositioningSettings, zero: float | None = None) -> None:
         super().__init__(bench, settings)
         self.reader = axis_reader(bench, settings)
         self.targets = positions(settings)

@@ -16,7 +16,7 @@ from errormotion.methods.linear_positioning.acquisition.measure import AxisMeasu
 from errormotion.methods.linear_positioning.moving import Cycle, cycles, ends, moving_of
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
     from errormotion.plugins import Bench
 
 
@@ -26,7 +26,7 @@ NOT_CONTINUED = (
 )
 
 
-def measure_moving(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def measure_moving(bench: Bench, settings: LinearPositioningSettings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield one raw dataset for each reading of both ends, to be joined along ``cycle``.
 
     Raises

@@ -18,20 +18,22 @@ from errormotion.methods.linear_positioning.planning.targets import sequence
 from errormotion.methods.linear_positioning.schema import APPROACHES, SCHEMA, STOPS
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
     from errormotion.plugins import Bench
 
 _M = {"units": "m"}
 
 
-def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def measure_diagonals(
+    bench: Bench, settings: LinearPositioningSettings, done: xr.Dataset | None
+) -> Iterator[xr.Dataset]:
     """Yield one raw dataset for each diagonal, to be joined along ``diagonal``.
 
     Parameters
     ----------
     bench : Bench
         With a ``controller`` (``move_to``, ``state``) and an ``interferometer`` or a ``laser_tracker`` in line.
-    settings : Settings
+    settings : LinearPositioningSettings
     done : Dataset, optional
         Diagonals of an interrupted run, which are not measured again. A virtual machine that was restarted repeats
         them, without their data.
@@ -59,7 +61,7 @@ def measure_diagonals(bench: Bench, settings: Settings, done: xr.Dataset | None)
         yield _measure(motion, line, stops, reader)
 
 
-def readers_of(bench: Bench, settings: Settings) -> list[Reader]:
+def readers_of(bench: Bench, settings: LinearPositioningSettings) -> list[Reader]:
     """Return the reader of each diagonal.
 
     Raises

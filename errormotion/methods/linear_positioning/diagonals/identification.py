@@ -28,7 +28,7 @@ from errormotion.methods.linear_positioning.identification.reading import (
 )
 from errormotion.methods.linear_positioning.identification.standard import FIGURES
 from errormotion.methods.linear_positioning.schema import APPROACHES
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 if TYPE_CHECKING:
     from errormotion.estimation.datum import Relative
@@ -41,7 +41,7 @@ REFERENCE = "first stop of each diagonal, approached forward, at the temperature
 _METRE = {"units": "m"}
 
 
-def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
+def evaluate(raw: xr.Dataset, settings: LinearPositioningSettings) -> Evaluated:
     """Return the readings along the diagonals that follow their schema, and their variances.
 
     Raises
@@ -87,7 +87,7 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     return Evaluated(readings, model.spreads_of(readings, settings, "Diagonal "), notes, trends, settings.cycle)
 
 
-def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, evaluated: Evaluated, settings: LinearPositioningSettings) -> Observed:
     """Return the readings along diagonals as a measurement model, with the errors along each over its stops."""
     readings, notes = evaluated.readings, [*evaluated.notes]
     points, (count, m) = _points(raw), readings.position.shape
@@ -193,6 +193,6 @@ def squareness(observed: Observed, relative: Relative) -> dict[str, xr.DataArray
     }
 
 
-def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:
+def extras(evaluated: Evaluated, solved: Solved, settings: LinearPositioningSettings) -> dict[str, xr.DataArray]:
     """Return the statistics of the standard at each stop, and the figures."""
     return statistics_of(evaluated, solved, settings, DIMS, _METRE)[1]

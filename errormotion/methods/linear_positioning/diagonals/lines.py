@@ -26,7 +26,7 @@ from errormotion.errors import MethodError
 from errormotion.methods.linear_positioning.planning.targets import randomised, standard_count
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Diagonals, Settings
+    from errormotion.methods.linear_positioning.settings import Diagonals, LinearPositioningSettings
 
 SQUARENESS = {"EC0Y": (0, 1, -1.0), "EA0Z": (1, 2, -1.0), "EB0Z": (0, 2, 1.0)}
 """The two axes of a face, and the sign of the shear by a squareness (ISO 230-1) along a diagonal."""
@@ -60,7 +60,7 @@ class Line:
         return np.asarray(np.round(self.start + distance * self.unit, DECIMALS))
 
 
-def diagonals_of(settings: Settings) -> Diagonals:
+def diagonals_of(settings: LinearPositioningSettings) -> Diagonals:
     """Return the settings of the diagonals; MethodError if there are none."""
     if settings.diagonals is None:
         raise MethodError(
@@ -69,7 +69,7 @@ def diagonals_of(settings: Settings) -> Diagonals:
     return settings.diagonals
 
 
-def lines(settings: Settings) -> list[Line]:
+def lines(settings: LinearPositioningSettings) -> list[Line]:
     """Return the diagonals in their order."""
     diagonals = diagonals_of(settings)
     result = []
@@ -83,7 +83,7 @@ def lines(settings: Settings) -> list[Line]:
     return result
 
 
-def distances(settings: Settings) -> Array:
+def distances(settings: LinearPositioningSettings) -> Array:
     """Return the distance of each stop from the start of its diagonal, (diagonal, stop), m; with random parts.
 
     The commanded positions are rounded to 1 um in each axis; the distances are those of the rounded positions.

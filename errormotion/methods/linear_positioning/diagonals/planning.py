@@ -14,13 +14,13 @@ from errormotion.plugins import Step
 
 if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 MM, MINUTE = 1e3, 60.0
 PROGRAM = "diagonals.nc"
 
 
-def stops(settings: Settings) -> Iterator[tuple[Line, Array, float]]:
+def stops(settings: LinearPositioningSettings) -> Iterator[tuple[Line, Array, float]]:
     """Yield every stop of the axes: its diagonal, position (3,), m, and dwell, s."""
     for line, distances_of_line in zip(lines(settings), distances(settings), strict=True):
         for approach in sequence(settings, distances_of_line):
@@ -29,7 +29,7 @@ def stops(settings: Settings) -> Iterator[tuple[Line, Array, float]]:
             yield line, line.point(approach.position), settings.dwell
 
 
-def steps(settings: Settings) -> list[Step]:
+def steps(settings: LinearPositioningSettings) -> list[Step]:
     """Return every step: a rapid move to the start of each diagonal, moves at the feed, and dwells."""
     result: list[Step] = []
     last: tuple[str, Array] | None = None
@@ -45,12 +45,12 @@ def steps(settings: Settings) -> list[Step]:
     return result
 
 
-def seconds(settings: Settings) -> float:
+def seconds(settings: LinearPositioningSettings) -> float:
     """Return the duration of the test at its feed, dwells included, s; accelerations and rapid moves are neglected."""
     return float(np.nansum([step.seconds for step in steps(settings)]))
 
 
-def programs(settings: Settings) -> Mapping[str, str]:
+def programs(settings: LinearPositioningSettings) -> Mapping[str, str]:
     """Return the NC program by file name; it stops (M0) before each diagonal, for the alignment of the instrument."""
     remaining = iter(lines(settings))
     text = [
@@ -72,7 +72,7 @@ def programs(settings: Settings) -> Mapping[str, str]:
     return {PROGRAM: "\n".join([*text, "M30", "%", ""])}
 
 
-def outside(settings: Settings, machine: MachineDescription) -> dict[str, str]:
+def outside(settings: LinearPositioningSettings, machine: MachineDescription) -> dict[str, str]:
     """Return by setting what the machine cannot do: axes that it does not have, stops outside its travel."""
     positions = np.array([position for _, position, _ in stops(settings)])
     for k, axis in enumerate("XYZ"):

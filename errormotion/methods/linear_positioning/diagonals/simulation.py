@@ -11,12 +11,12 @@ from errormotion.methods.linear_positioning.diagonals.lines import distances, li
 from errormotion.methods.linear_positioning.schema import APPROACHES, SCHEMA, STOPS
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
     from errormotion.twin import VirtualMachine
 
 
 def expected_diagonals(
-    settings: Settings, machine: VirtualMachine, reversal: float, scatter: float, drift: float
+    settings: LinearPositioningSettings, machine: VirtualMachine, reversal: float, scatter: float, drift: float
 ) -> xr.Dataset:
     """Return readings along the diagonals of the settings without noise, which states ``scatter`` and ``drift``, m."""
     diagonals, distance = lines(settings), distances(settings)

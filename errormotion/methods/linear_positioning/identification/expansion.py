@@ -16,7 +16,7 @@ import xarray as xr
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
-from errormotion.methods.linear_positioning.settings import Budget, Settings
+from errormotion.methods.linear_positioning.settings import Budget, LinearPositioningSettings
 from errormotion.methods.linear_positioning.settings import Side as Stated
 
 SIDES = {"machine": 1.0, "workpiece": -1.0}
@@ -49,7 +49,11 @@ class Side:
 
 
 def sides_of(
-    raw: xr.Dataset, temperature: Mapping[str, Array], shape: tuple[int, ...], settings: Settings, notes: list[str]
+    raw: xr.Dataset,
+    temperature: Mapping[str, Array],
+    shape: tuple[int, ...],
+    settings: LinearPositioningSettings,
+    notes: list[str],
 ) -> list[Side]:
     """Return the sides whose expansion data or settings state; remarks are appended to ``notes``.
 
@@ -88,7 +92,7 @@ def sides_of(
     return found
 
 
-def _assumptions(raw: xr.Dataset, name: str, side: Stated, settings: Settings) -> list[str]:
+def _assumptions(raw: xr.Dataset, name: str, side: Stated, settings: LinearPositioningSettings) -> list[str]:
     """Return a note on each uncertainty of a side that has the default of its setting."""
     notes = []
     if f"{name}_expansion_uncertainty" not in raw and side.expansion_uncertainty == Stated().expansion_uncertainty:

@@ -19,7 +19,7 @@ from errormotion.methods.linear_positioning.identification.reading import LENGTH
 from errormotion.methods.linear_positioning.identification.scatter import Scatter
 from errormotion.methods.linear_positioning.identification.standard import FIGURES, MEANINGS
 from errormotion.methods.linear_positioning.schema import APPROACHES
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
@@ -45,7 +45,7 @@ class Evaluated:
         return [*corrected, *(f"{name}: {ONE_VARIANCE[spread.pooled]}" for name, spread in named)]
 
 
-def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
+def evaluate(raw: xr.Dataset, settings: LinearPositioningSettings) -> Evaluated:
     """Return the readings of an axis that follow their schema, and their variances.
 
     Raises
@@ -66,7 +66,7 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     return Evaluated(readings, spreads, [*notes, *model.trend_notes(readings, trends)], trends, settings.cycle)
 
 
-def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, evaluated: Evaluated, settings: LinearPositioningSettings) -> Observed:
     """Return the readings of an axis as a measurement model, with its errors over ``position``."""
     readings, notes = evaluated.readings, [*evaluated.notes]
     axis, names, position = readings.axis, readings.names, readings.position[0]
@@ -148,7 +148,11 @@ def _figures(evaluated: Evaluated, solved: Solved, k: int, trials: int, *, align
 
 
 def statistics_of(
-    evaluated: Evaluated, solved: Solved, settings: Settings, dims: tuple[str, str], attrs: dict[str, str]
+    evaluated: Evaluated,
+    solved: Solved,
+    settings: LinearPositioningSettings,
+    dims: tuple[str, str],
+    attrs: dict[str, str],
 ) -> tuple[list[Extremes], dict[str, xr.DataArray]]:
     """Return the figures of each line, and with them the statistics of the standard and the corrected readings.
 
@@ -184,7 +188,7 @@ def statistics_of(
     }
 
 
-def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:
+def extras(evaluated: Evaluated, solved: Solved, settings: LinearPositioningSettings) -> dict[str, xr.DataArray]:
     """Return statistics and figures of an axis, its reversal, and the figures of the positioning by name."""
     readings, dims = evaluated.readings, ("freedom", "position")
     attrs = {"comment": "m, rad"}

@@ -49,7 +49,7 @@ from errormotion.methods.linear_positioning.schema import APPROACHES
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
     from errormotion.methods.linear_positioning.identification.reading import Readings
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 T = TypeVar("T")
 TREND = "trend over the test"
@@ -85,7 +85,7 @@ class Known(NamedTuple, Generic[T]):
     temperature: T
 
 
-def spreads_of(readings: Readings, settings: Settings, what: str = "") -> list[Scatter]:
+def spreads_of(readings: Readings, settings: LinearPositioningSettings, what: str = "") -> list[Scatter]:
     """Return the variances of each line; ``what`` it is, for messages, such as "Diagonal "."""
     spreads = []
     for k, (x, z) in enumerate(zip(readings.corrected, readings.z, strict=True)):

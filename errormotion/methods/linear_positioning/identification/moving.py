@@ -32,7 +32,7 @@ from errormotion.methods.linear_positioning.identification.reading import (
     point_of,
 )
 from errormotion.methods.linear_positioning.identification.scatter import EQUAL
-from errormotion.methods.linear_positioning.settings import Settings
+from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 if TYPE_CHECKING:
     from errormotion.measurement.observed import Solved
@@ -121,7 +121,7 @@ class Evaluated:
         return np.asarray((self.position - self.position[0])[:, None] * along)
 
 
-def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
+def evaluate(raw: xr.Dataset, settings: LinearPositioningSettings) -> Evaluated:
     """Return the readings of a moving axis that follow their schema.
 
     Raises
@@ -152,7 +152,7 @@ def evaluate(raw: xr.Dataset, settings: Settings) -> Evaluated:
     return Evaluated(axis, freedoms, time, moving, P[order], x, order, np.fmax(noise, stated), length, notes)
 
 
-def observe(raw: xr.Dataset, evaluated: Evaluated, settings: Settings) -> Observed:
+def observe(raw: xr.Dataset, evaluated: Evaluated, settings: LinearPositioningSettings) -> Observed:
     """Return the readings of a moving axis as a measurement model, with its errors over time at both ends."""
     t, lever, count = evaluated.t, evaluated.lever, len(evaluated.freedoms)
     names = [iso_names(evaluated.axis)[name] for name in evaluated.freedoms]
@@ -239,7 +239,7 @@ def _finished(solved: Solved, names: list[str]) -> Solved:
     return replace(solved, observed=observed, relative=relative, scatter=replace(solved.scatter, note=""))
 
 
-def extras(evaluated: Evaluated, solved: Solved, settings: Settings) -> dict[str, xr.DataArray]:  # noqa: ARG001
+def extras(evaluated: Evaluated, solved: Solved, settings: LinearPositioningSettings) -> dict[str, xr.DataArray]:  # noqa: ARG001
     """Return the figures of ISO 230-3: ranges and changes at both ends and of the length between them."""
     value = solved.relative.errors.value.reshape(evaluated.t.size, 2, -1)
     u_cold = evaluated.noise / np.sqrt(np.isfinite(evaluated.x[evaluated.cold]).sum(axis=0))  # (end, freedom)

@@ -16,7 +16,7 @@ from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF, LINEAR_AXES, direction_of, iso_names
 from errormotion.methods.linear_positioning.identification.expansion import Side, sides_of
 from errormotion.methods.linear_positioning.schema import APPROACHES
-from errormotion.methods.linear_positioning.settings import ASSUMED_ALIGNMENT, ASSUMED_LENGTH, Settings
+from errormotion.methods.linear_positioning.settings import ASSUMED_ALIGNMENT, ASSUMED_LENGTH, LinearPositioningSettings
 
 LENGTHS = ("EX", "EY", "EZ")
 MIN_TARGETS = 3
@@ -88,7 +88,7 @@ class Readings:
         return np.asarray((self.position - self.position.mean(axis=1, keepdims=True)) / half)
 
 
-def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
+def read(raw: xr.Dataset, settings: LinearPositioningSettings, notes: list[str]) -> Readings:
     """Return the readings of an axis from raw data that follow their schema; remarks are appended to ``notes``.
 
     Raises
@@ -153,7 +153,9 @@ def missing(measured: Array, raw: xr.Dataset) -> list[str]:
     return notes
 
 
-def instrument(raw: xr.Dataset, settings: Settings, lengths: NDArray[np.bool_], notes: list[str]) -> dict[str, Any]:
+def instrument(
+    raw: xr.Dataset, settings: LinearPositioningSettings, lengths: NDArray[np.bool_], notes: list[str]
+) -> dict[str, Any]:
     """Return what data or settings state about instrument and scatter; each assumption about lengths has a note."""
     stated, count = settings.uncertainty, len(lengths)
     alignment = float(raw["alignment_uncertainty"]) if "alignment_uncertainty" in raw else stated.alignment
@@ -196,7 +198,7 @@ def per_line(raw: xr.Dataset, name: str, count: int) -> Array:
     return values
 
 
-def assumed_length(raw: xr.Dataset, settings: Settings) -> str:
+def assumed_length(raw: xr.Dataset, settings: LinearPositioningSettings) -> str:
     """Return a note if the uncertainty of lengths is assumed; else an empty text."""
     if "length_uncertainty" in raw or settings.uncertainty.length is not None:
         return ""
@@ -206,7 +208,7 @@ def assumed_length(raw: xr.Dataset, settings: Settings) -> str:
     )
 
 
-def length_uncertainty(raw: xr.Dataset, settings: Settings) -> float:
+def length_uncertainty(raw: xr.Dataset, settings: LinearPositioningSettings) -> float:
     """Return the relative standard uncertainty of lengths, of the data or else of the settings."""
     return float(raw["length_uncertainty"]) if "length_uncertainty" in raw else settings.uncertainty.length_or_assumed
 
@@ -286,7 +288,7 @@ def temperatures(raw: xr.Dataset, approach: NDArray[np.intp], ordered: NDArray[n
     return {name: by_approach(values[k][..., ordered], approach, axis=0) for k, name in enumerate(sensors)}
 
 
-def point_of(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Array:
+def point_of(raw: xr.Dataset, settings: LinearPositioningSettings, notes: list[str]) -> Array:
     """Return the functional point of the data or settings, (3,), m; (0, 0, 0) with a note if neither states it."""
     if "functional_point" in raw:
         stated = raw["functional_point"]

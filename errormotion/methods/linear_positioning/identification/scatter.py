@@ -35,7 +35,7 @@ from errormotion.estimation.variance import expansion
 from errormotion.kinematics.iso import DOF, direction_of
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 T = TypeVar("T")
 EFFECTS = ("offset", "slope", "opposite offset", "opposite slope")
@@ -171,7 +171,7 @@ def scatter(
     )
 
 
-def lacking(settings: Settings) -> dict[str, str]:
+def lacking(settings: LinearPositioningSettings) -> dict[str, str]:
     """Return by setting what `scatter` will lack whatever is measured; only that of the positioning can be stated."""
     stated, only = settings.uncertainty, settings.freedoms == (DOF[direction_of(settings.axis)],)
     if settings.runs == 1:

@@ -13,13 +13,13 @@ from errormotion.methods.linear_positioning.planning.targets import positions, r
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 MM, MINUTE = 1e3, 60.0
 PROGRAM = "positioning.nc"
 
 
-def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
+def stops(settings: LinearPositioningSettings) -> Iterator[tuple[float, float, float]]:
     """Yield every stop of the axis: position, m, feed of the move to it, m/s, and dwell, s.
 
     Raises
@@ -37,7 +37,7 @@ def stops(settings: Settings) -> Iterator[tuple[float, float, float]]:
         yield approach.position, settings.feed, settings.dwell
 
 
-def steps(settings: Settings) -> list[Step]:
+def steps(settings: LinearPositioningSettings) -> list[Step]:
     """Return every step of the machine: a rapid move to the start, then moves at the feed, and dwells."""
     k = "XYZ".index(settings.axis)
     result: list[Step] = []
@@ -54,7 +54,7 @@ def steps(settings: Settings) -> list[Step]:
     return result
 
 
-def programs(settings: Settings) -> Mapping[str, str]:
+def programs(settings: LinearPositioningSettings) -> Mapping[str, str]:
     """Return the NC program of the test by file name: one line per move, and a dwell at each target.
 
     An instrument that records whenever the axis is at rest takes one reading per target, in the order of the program.

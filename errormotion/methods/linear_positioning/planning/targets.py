@@ -12,7 +12,7 @@ import numpy as np
 from errormotion.arrays import Array
 
 if TYPE_CHECKING:
-    from errormotion.methods.linear_positioning.settings import Settings
+    from errormotion.methods.linear_positioning.settings import LinearPositioningSettings
 
 LONG_TRAVEL = 2.0
 """Travel up to which the standard requires five targets per metre, m; beyond it, an interval of 250 mm."""
@@ -36,7 +36,7 @@ class Approach:
     position: float
 
 
-def positions(settings: Settings) -> Array:
+def positions(settings: LinearPositioningSettings) -> Array:
     """Return the target positions in increasing order, (target,), m.
 
     A position is a multiple of the interval plus a random part, so that the targets are not periodic like a screw or a
@@ -48,7 +48,7 @@ def positions(settings: Settings) -> Array:
     return randomised(low, high, settings.count or standard_count(high - low), settings)
 
 
-def randomised(low: float, high: float, count: int, settings: Settings) -> Array:
+def randomised(low: float, high: float, count: int, settings: LinearPositioningSettings) -> Array:
     """Return positions from ``low`` to ``high`` with their random parts, (count,), m."""
     interval = (high - low) / (count - 1)
     largest = min(RANDOM_SHARE * interval if settings.random_part is None else settings.random_part, 0.49 * interval)
@@ -65,7 +65,7 @@ def standard_count(length: float) -> int:
     return max(FEWEST, math.ceil(length / LONG_INTERVAL - 1e-9) + 1)
 
 
-def sequence(settings: Settings, targets: Array | None = None) -> Iterator[Approach]:
+def sequence(settings: LinearPositioningSettings, targets: Array | None = None) -> Iterator[Approach]:
     """Yield the approaches to targets, m, by default those of the settings, in the order of the cycle."""
     P = [float(position) for position in (positions(settings) if targets is None else targets)]
     overrun = settings.overrun
@@ -83,13 +83,13 @@ def sequence(settings: Settings, targets: Array | None = None) -> Iterator[Appro
             yield Approach(run, 1, i, position + overrun, position)
 
 
-def reach(settings: Settings) -> tuple[float, float]:
+def reach(settings: LinearPositioningSettings) -> tuple[float, float]:
     """Return the lowest and highest position of the axis, overrun included, m."""
     P = positions(settings)
     return float(P[0]) - settings.overrun, float(P[-1]) + settings.overrun
 
 
-def seconds(settings: Settings) -> float:
+def seconds(settings: LinearPositioningSettings) -> float:
     """Return the duration of the test at its feed, dwells included, s; accelerations are neglected."""
     total, last = 0.0, None
     for approach in sequence(settings):

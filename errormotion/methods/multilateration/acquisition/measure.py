@@ -27,7 +27,7 @@ from errormotion.plugins.virtual import is_virtual, wait
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from errormotion.methods.multilateration.settings import Measuring, Settings
+    from errormotion.methods.multilateration.settings import Measuring, MultilaterationSettings
     from errormotion.plugins import Bench
 
 NO_VALUE = "no value"
@@ -45,7 +45,7 @@ _WRONG_STATION = 2.0
 
 def measure_stations(
     bench: Bench,
-    settings: Settings,
+    settings: MultilaterationSettings,
     inputs: Mapping[str, xr.Dataset],  # noqa: ARG001 - the same for every method
     done: xr.Dataset | None,
     measuring: Measuring | None = None,
@@ -57,7 +57,7 @@ def measure_stations(
     bench : Bench
         With a ``laser_tracker`` (``measure``) and a ``controller`` (``move_to``, ``state``). The operator is requested
         to place the tracker; a virtual machine does it.
-    settings : Settings
+    settings : MultilaterationSettings
     inputs : mapping
         Not used.
     done : Dataset, optional
@@ -118,7 +118,7 @@ class SetUps:
         Stations in the order of their set-ups, from 0.
     """
 
-    def __init__(self, bench: Bench, settings: Settings, measuring: Measuring) -> None:
+    def __init__(self, bench: Bench, settings: MultilaterationSettings, measuring: Measuring) -> None:
         self.bench, self.settings, self.measuring = bench, settings, measuring
         self.tracker: Any = bench.of_kind("laser_tracker")
         if not hasattr(self.tracker, "measure"):

@@ -13,10 +13,10 @@ from errormotion.methods.multilateration.planning import layout
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.multilateration.settings import Measuring, Settings
+    from errormotion.methods.multilateration.settings import Measuring, MultilaterationSettings
 
 
-def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
+def tour(settings: MultilaterationSettings, returns: int) -> tuple[Array, Array, list[int]]:
     """Return axis positions and positions of the reflector, both (m, 3), m, and the order of visits.
 
     Targets that are visited again (``returns``) are appended.
@@ -29,7 +29,7 @@ def tour(settings: Settings, returns: int) -> tuple[Array, Array, list[int]]:
     return np.concatenate([position, position[again]]), np.concatenate([target, target[again]]), order
 
 
-def stations(settings: Settings, measuring: Measuring) -> list[int]:
+def stations(settings: MultilaterationSettings, measuring: Measuring) -> list[int]:
     """Return the stations in the order of their set-ups, from 0; MethodError for one that does not exist."""
     count = len(settings.layout.stations)
     sequence = measuring.sequence or tuple(range(1, count + 1))
@@ -41,7 +41,7 @@ def stations(settings: Settings, measuring: Measuring) -> list[int]:
     return [k - 1 for k in sequence]
 
 
-def steps(settings: Settings) -> list[Step]:
+def steps(settings: MultilaterationSettings) -> list[Step]:
     """Return every step of all set-ups, without repetitions: rapid moves, and dwells."""
     position, _, order = tour(settings, settings.measuring.returns)
     result: list[Step] = []

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from errormotion.methods.multilateration.settings import Planning, Settings
+    from errormotion.methods.multilateration.settings import MultilaterationSettings, Planning
 
 SETUPS = ("as set", "best")
 _COARSE = 4
 """Targets along each axis for the search of positions: the largest uncertainties are at the faces."""
 
 
-def expected(settings: Settings) -> xr.Dataset:
+def expected(settings: MultilaterationSettings) -> xr.Dataset:
     """Return the raw data of the layout of the settings without errors and noise, each target visited once."""
     p = settings.layout
     target = layout.grid(p)[1]
@@ -56,7 +56,7 @@ def expected(settings: Settings) -> xr.Dataset:
     return xr.Dataset(variables, coords, attrs)
 
 
-def with_best_layout(planned: xr.Dataset, settings: Settings, planning: Planning) -> xr.Dataset:
+def with_best_layout(planned: xr.Dataset, settings: MultilaterationSettings, planning: Planning) -> xr.Dataset:
     """Return the plan of the layout of the settings with the best layout.
 
     Further variables; standard uncertainties are those of three coordinates together, by the readings only, m:
@@ -70,7 +70,7 @@ def with_best_layout(planned: xr.Dataset, settings: Settings, planning: Planning
     Parameters
     ----------
     planned : Dataset
-    settings : Settings
+    settings : MultilaterationSettings
     planning : Planning
         Boxes, obstacles, reflector, and the minimised quantity.
 
@@ -129,7 +129,7 @@ def _uncertainty(station: Array, target: Array, sees: NDArray[np.bool_], noise: 
     return found
 
 
-def reading_noise(settings: Settings) -> float:
+def reading_noise(settings: MultilaterationSettings) -> float:
     """Return the standard deviation of a reading, m: of the tracker, and with separate set-ups of the machine."""
     repeated = 0.0 if settings.together else settings.repeatability or 0.0
     return float(np.hypot(settings.layout.displacement_noise, repeated))
@@ -171,7 +171,9 @@ def _minimised(planning: Planning, sigma: Array) -> float:
     return float(np.nanmax(sigma) if planning.minimise == "largest" else np.nanmean(sigma))
 
 
-def _best_stations(settings: Settings, planning: Planning, sight: Sight, own: Array, here: Array) -> Choice:
+def _best_stations(
+    settings: MultilaterationSettings, planning: Planning, sight: Sight, own: Array, here: Array
+) -> Choice:
     """Return the best stations and the uncertainty at the targets; the layout as set if none are better."""
     p, noise = settings.layout, reading_noise(settings)
     position, target = layout.grid(p)

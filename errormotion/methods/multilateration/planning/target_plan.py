@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from errormotion.methods.multilateration.planning.sight import Sight
-    from errormotion.methods.multilateration.settings import Choosing, Planning, Settings
+    from errormotion.methods.multilateration.settings import Choosing, MultilaterationSettings, Planning
 
 _ROUNDS = 3
 _MIN_GAIN = 0.01
@@ -62,7 +62,7 @@ class Choice:
 
 
 def choose(
-    settings: Settings, planning: Planning, choosing: Choosing, sight: Sight, boxes: Array, noise: float
+    settings: MultilaterationSettings, planning: Planning, choosing: Choosing, sight: Sight, boxes: Array, noise: float
 ) -> Choice:
     """Return the targets and stations with the smallest uncertainty over the volume.
 
@@ -131,7 +131,7 @@ def power_mean(sigma: Array, planning: Planning) -> float:
     return top * float(np.mean((known / top) ** power) ** (1 / power) * np.exp(10 * unseen))
 
 
-def _expected(settings: Settings, choosing: Choosing, position: Array) -> Expected | None:
+def _expected(settings: MultilaterationSettings, choosing: Choosing, position: Array) -> Expected | None:
     if choosing.uncertainty == "target":
         return None
     if settings.chain is None:

@@ -18,7 +18,7 @@ from errormotion.methods.normal_vector.acquisition import touching
 from errormotion.plugins import Step, Touch
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 Position = tuple[float, float, float]
 
@@ -31,7 +31,7 @@ EARLY_START = 0.1
 _SAME_POSITION = 1e-9  # m
 
 
-def cycle_touches(settings: Settings, tip_radius: float) -> tuple[list[Touch], list[tuple[int, int]]]:
+def cycle_touches(settings: NormalVectorSettings, tip_radius: float) -> tuple[list[Touch], list[tuple[int, int]]]:
     """Return the touches of one cycle in their order, and the numbers of ball and touch of each.
 
     A touch starts ``approach`` before the contact with a ball at its approximate position, and ends ``overtravel``
@@ -92,12 +92,12 @@ def safe_height(touches: Sequence[Touch], clearance: float) -> float:
     return max(touch.start[2] for touch in touches) + clearance
 
 
-def cycle_steps(settings: Settings, probe: Any = None, here: Position | None = None) -> list[Step]:
+def cycle_steps(settings: NormalVectorSettings, probe: Any = None, here: Position | None = None) -> list[Step]:
     """Return every step of one cycle.
 
     Parameters
     ----------
-    settings : Settings
+    settings : NormalVectorSettings
     probe : settings of the bench's touch probe, optional
         Its feeds and its clearance have priority over those of the method.
     here : (3,) tuple of float, optional
@@ -160,7 +160,7 @@ class Part:
     cycle: list[Step]
 
 
-def parts(settings: Settings, probe: Any = None) -> Iterator[Part]:
+def parts(settings: NormalVectorSettings, probe: Any = None) -> Iterator[Part]:
     """Yield the cold cycle, and every later one with the warm-up before it; ``probe`` as for `cycle_steps`."""
     now, cold, number = 0.0, 0.0, 0
     here: Position | None = None
@@ -181,12 +181,12 @@ def parts(settings: Settings, probe: Any = None) -> Iterator[Part]:
         number += 1
 
 
-def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+def campaign_steps(settings: NormalVectorSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
     """Return every step of the cold cycle, the warm-up and all its cycles.
 
     Parameters
     ----------
-    settings : Settings
+    settings : NormalVectorSettings
     instruments : mapping of str to settings, optional
         Settings of the bench's instruments by their kind.
 
@@ -211,7 +211,7 @@ def campaign_steps(settings: Settings, instruments: Mapping[str, Any] | None = N
     return steps
 
 
-def warm_up_steps(settings: Settings, start: float, end: float, here: Position | None = None) -> list[Step]:
+def warm_up_steps(settings: NormalVectorSettings, start: float, end: float, here: Position | None = None) -> list[Step]:
     """Return the steps between two times of the warm-up, s: spindle speeds, and moves or rests.
 
     The first move starts at ``here``, if this is known.
@@ -236,7 +236,7 @@ def warm_up_steps(settings: Settings, start: float, end: float, here: Position |
     return steps
 
 
-def speed_at(settings: Settings, time: float) -> tuple[float, float]:
+def speed_at(settings: NormalVectorSettings, time: float) -> tuple[float, float]:
     """Return the spindle speed (1/min) at a time of the warm-up, and the time of its next change, s."""
     speed = 0.0
     for event in settings.schedule:
@@ -246,12 +246,12 @@ def speed_at(settings: Settings, time: float) -> tuple[float, float]:
     return speed, math.inf
 
 
-def cycles(settings: Settings) -> int:
+def cycles(settings: NormalVectorSettings) -> int:
     """Return the number of probing cycles, including the cold one."""
     return int(settings.duration / settings.interval + 1e-9) + 1
 
 
-def due(settings: Settings, number: int, now: float) -> int:
+def due(settings: NormalVectorSettings, number: int, now: float) -> int:
     """Return the number of the next cycle, ``number`` or later, at a time since the start of the cold cycle, s.
 
     A late cycle starts immediately; it is omitted if its successor is due as well.
@@ -259,12 +259,12 @@ def due(settings: Settings, number: int, now: float) -> int:
     return max(number, int((now + MIN_STEP) // settings.interval))
 
 
-def following(settings: Settings, last: float) -> int:
+def following(settings: NormalVectorSettings, last: float) -> int:
     """Return the number of the cycle after one that started at a time since the start of the cold cycle, s."""
     return int(last / settings.interval + EARLY_START) + 1
 
 
-def planned_history(part: Part, settings: Settings) -> tuple[float, float]:
+def planned_history(part: Part, settings: NormalVectorSettings) -> tuple[float, float]:
     """Return mean spindle speed (1/min) and mean feed (m/s) between the previous cycle and this one."""
     turned = math.fsum(step.spindle_speed * step.seconds for step in part.warm_up)
     path = math.fsum(step.feed * step.seconds for step in part.warm_up if step.place is not None)

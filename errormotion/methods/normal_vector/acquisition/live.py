@@ -13,7 +13,7 @@ from errormotion.methods.normal_vector.acquisition import cycle
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 
 class LiveBalls:
@@ -23,7 +23,7 @@ class LiveBalls:
     rotations and uncertainty. The result is identified from the whole record afterwards.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: NormalVectorSettings) -> None:
         self._settings = settings
         self._first: Array | None = None
         self._since = ""

@@ -20,7 +20,7 @@ from errormotion.methods.normal_vector.acquisition.warming import Warming, age, 
 from errormotion.plugins import Bench, Contact, Touch
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ LAST_LINES_TIMEOUT = 2.0
 Measure = Callable[[list[Touch]], Iterator[Contact]]
 
 
-def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def acquire(bench: Bench, settings: NormalVectorSettings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield one raw dataset for each cycle, the cold one first.
 
     Parameters
@@ -40,7 +40,7 @@ def acquire(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterat
     bench : Bench
         With a ``touch_probe``; a ``controller`` that moves the axes and turns the spindle, unless the operator starts a
         program that does so; and any number of thermometers.
-    settings : Settings
+    settings : NormalVectorSettings
     done : Dataset, optional
         Cycles of an interrupted run, which is continued.
 
@@ -191,7 +191,7 @@ def _with_machine_state(error: BaseException, control: Any) -> BaseException:
     return extended
 
 
-def _due(settings: Settings, number: int, now: float) -> int:
+def _due(settings: NormalVectorSettings, number: int, now: float) -> int:
     """Return the number of the next cycle, and log those that are omitted."""
     due = cycle.due(settings, number, now)
     if due > number:

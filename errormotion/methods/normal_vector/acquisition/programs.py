@@ -17,7 +17,7 @@ from errormotion.methods.normal_vector.acquisition import cycle, touching
 from errormotion.plugins import Step, Touch
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 MM, MINUTE = 1e3, 60.0
 CYCLE, WARM_UP = "cycle.nc", "warm_up.nc"
@@ -26,7 +26,7 @@ _SAME_POSITION = 1e-6  # m, resolution of the programs
 _PRINT = "DPRNT[N{number}*X#5061[53]*Y#5062[53]*Z#5063[53]*T#3001[80]]"
 
 
-def programs(settings: Settings) -> Mapping[str, str]:
+def programs(settings: NormalVectorSettings) -> Mapping[str, str]:
     """Return one probing cycle, and the whole warm-up with all cycles, as NC programs by file name.
 
     Raises
@@ -37,14 +37,14 @@ def programs(settings: Settings) -> Mapping[str, str]:
     return {CYCLE: cycle_program(settings), WARM_UP: warm_up_program(settings)}
 
 
-def cycle_program(settings: Settings, tip_radius: float | None = None) -> str:
+def cycle_program(settings: NormalVectorSettings, tip_radius: float | None = None) -> str:
     """Return one probing cycle as a program; ``tip_radius`` (m) is used if the settings have none."""
     part = next(cycle.parts(settings))
     body = [*_to_probe(settings, settings.settle), *_cycle(settings, None, tip_radius)]
     return _text(CYCLE, "one probing cycle", body, settings, _seconds(part))
 
 
-def warm_up_program(settings: Settings) -> str:
+def warm_up_program(settings: NormalVectorSettings) -> str:
     """Return the cold cycle, the warm-up and all later cycles as a program.
 
     Each cycle has its number as sequence number, before its warm-up: the program can be restarted there.
@@ -64,7 +64,7 @@ def _seconds(part: cycle.Part) -> float:
     return math.fsum(step.seconds for step in (*part.warm_up, *part.cycle)) + part.settle
 
 
-def _text(name: str, purpose: str, body: list[str], settings: Settings, seconds: float) -> str:
+def _text(name: str, purpose: str, body: list[str], settings: NormalVectorSettings, seconds: float) -> str:
     head = [
         "%",
         f"({name}: {purpose}, about {seconds / 60:.1f} min)",
@@ -75,18 +75,18 @@ def _text(name: str, purpose: str, body: list[str], settings: Settings, seconds:
     return "\n".join([*head, *body, "M30", "%", ""])
 
 
-def _to_probe(settings: Settings, settle: float) -> list[str]:
+def _to_probe(settings: NormalVectorSettings, settle: float) -> list[str]:
     """Return the lines that stop the spindle, insert the probe, and let the machine settle."""
     return ["M5", *settings.to_probe, *([_dwell(settings, settle)] if settle else [])]
 
 
-def _first_up(settings: Settings, tip_radius: float | None = None) -> str:
+def _first_up(settings: NormalVectorSettings, tip_radius: float | None = None) -> str:
     """Return the move to the safe height from any position of the tip."""
     high = cycle.safe_height(_touches(settings, tip_radius), settings.clearance)
     return f"G1 Z{high * MM:.3f} F{_feed(settings.positioning_feed)}"
 
 
-def _touches(settings: Settings, tip_radius: float | None) -> list[Touch]:
+def _touches(settings: NormalVectorSettings, tip_radius: float | None) -> list[Touch]:
     if not settings.balls:
         raise MethodError(
             "balls: expected the approximate centres of three or more balls; found none.", code="probing.balls.too_few"
@@ -94,7 +94,9 @@ def _touches(settings: Settings, tip_radius: float | None) -> list[Touch]:
     return cycle.cycle_touches(settings, settings.tip_radius or tip_radius or cycle.TIP_RADIUS)[0]
 
 
-def _cycle(settings: Settings, here: cycle.Position | None, tip_radius: float | None = None) -> Iterator[str]:
+def _cycle(
+    settings: NormalVectorSettings, here: cycle.Position | None, tip_radius: float | None = None
+) -> Iterator[str]:
     names, feed = touching.names(settings), _feed(settings.positioning_feed)
     number, ball = 0, -1
     yield "POPEN"
@@ -120,7 +122,7 @@ def _plain(name: str) -> str:
     return re.sub(r"[^ -~]|[()]", "?", name)
 
 
-def _warm_up(settings: Settings, steps: list[Step]) -> Iterator[str]:
+def _warm_up(settings: NormalVectorSettings, steps: list[Step]) -> Iterator[str]:
     speed: float | None = None
     for step in steps:
         if step.spindle_speed != speed:
@@ -132,7 +134,7 @@ def _warm_up(settings: Settings, steps: list[Step]) -> Iterator[str]:
             yield _dwell(settings, step.seconds)
 
 
-def _dwell(settings: Settings, seconds: float) -> str:
+def _dwell(settings: NormalVectorSettings, seconds: float) -> str:
     word, unit = settings.dwell.split()
     return f"G4 {word}{seconds:.3f}" if unit == "s" else f"G4 {word}{1e3 * seconds:.0f}"
 

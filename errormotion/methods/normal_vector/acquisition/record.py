@@ -18,7 +18,7 @@ from errormotion.methods.normal_vector.schema import SCHEMA, TOUCH_FLAGS
 from errormotion.plugins import Bench, Contact
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class Record:
     ----------
     bench : Bench
         Its thermometers are read at the start of each cycle; missing readings are NaN.
-    settings : Settings
+    settings : NormalVectorSettings
     probe : touch probe
     done : Dataset, optional
         Cycles of an interrupted run.
@@ -51,7 +51,7 @@ class Record:
         Of every cycle, in order.
     """
 
-    def __init__(self, bench: Bench, settings: Settings, probe: Any, done: xr.Dataset | None) -> None:
+    def __init__(self, bench: Bench, settings: NormalVectorSettings, probe: Any, done: xr.Dataset | None) -> None:
         self.settings = settings
         self.first = 0 if done is None else cycle.following(settings, float(done["time"].values[-1]))
         self.tip_radius = float(settings.tip_radius or probe.tip_radius)

@@ -9,7 +9,7 @@ import numpy as np
 from errormotion.arrays import Array
 
 if TYPE_CHECKING:
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 
 def touch_normals(touches: int, elevation: float = 0.0) -> Array:
@@ -24,11 +24,11 @@ def touch_normals(touches: int, elevation: float = 0.0) -> Array:
     return np.concatenate([np.round(ring, 15), [[0.0, 0.0, 1.0]]])
 
 
-def normals(settings: Settings) -> Array:
+def normals(settings: NormalVectorSettings) -> Array:
     """Return the touch directions of each ball of the settings, (ball, touch, 3)."""
     return np.tile(touch_normals(settings.touches, settings.elevation), (len(settings.balls), 1, 1))
 
 
-def names(settings: Settings) -> list[str]:
+def names(settings: NormalVectorSettings) -> list[str]:
     """Return the names of the balls."""
     return [ball.name or str(i + 1) for i, ball in enumerate(settings.balls)]

@@ -18,7 +18,7 @@ from errormotion.plugins.virtual import wait
 if TYPE_CHECKING:
     import xarray as xr
 
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ class Warming:
     ----------
     control : controller
         With ``state``, ``move_to``, ``spindle`` and ``stop``.
-    settings : Settings
+    settings : NormalVectorSettings
     done : Dataset, optional
         Cycles of an interrupted run.
 
@@ -55,7 +55,7 @@ class Warming:
         The machine is in alarm or emergency stop, or not homed.
     """
 
-    def __init__(self, control: Any, settings: Settings, done: xr.Dataset | None) -> None:
+    def __init__(self, control: Any, settings: NormalVectorSettings, done: xr.Dataset | None) -> None:
         self.control, self.settings = control, settings
         self.warm_from: float | None = None
         self.repeats = False

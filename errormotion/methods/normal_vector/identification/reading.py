@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from errormotion.methods.normal_vector.settings import Settings
+    from errormotion.methods.normal_vector.settings import NormalVectorSettings
 
 AXES = ("XYZ", "XY", "XZ", "YZ", "X", "Y", "Z", "")
 """Linear axes that may carry the tool."""
@@ -58,7 +58,7 @@ class Readings:
         return "the touches" if self.seen.touched else "the centres"
 
 
-def read(raw: xr.Dataset, settings: Settings, notes: list[str]) -> Readings:
+def read(raw: xr.Dataset, settings: NormalVectorSettings, notes: list[str]) -> Readings:
     """Return the readings of a raw dataset.
 
     Raises
@@ -233,7 +233,9 @@ def _check_times(time: Array, valid: NDArray[np.bool_]) -> None:
             )
 
 
-def _weights(raw: xr.Dataset, settings: Settings, valid: NDArray[np.bool_], touched: bool) -> tuple[Array, float]:
+def _weights(
+    raw: xr.Dataset, settings: NormalVectorSettings, valid: NDArray[np.bool_], touched: bool
+) -> tuple[Array, float]:
     k, b, m = valid.shape
     diagonal = np.zeros((k, b, m, m))
     diagonal[..., range(m), range(m)] = valid

@@ -25,10 +25,10 @@ from errormotion.plugins.virtual import is_virtual
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
-def detect_beams(bench: Bench, settings: Settings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
+def detect_beams(bench: Bench, settings: SpindleDriftSettings, done: xr.Dataset | None) -> Iterator[xr.Dataset]:
     """Yield the record of a sphere that is stepped through every beam, chunk by chunk along ``sample``.
 
     Sensor and machine need no synchronisation, because the rests are detected in the record. An interrupted scan is
@@ -95,7 +95,7 @@ def last_attempts(raw: xr.Dataset) -> dict[int, tuple[int, int]]:
     return last
 
 
-def _scan_plan(bench: Bench, frame: Any, settings: Settings) -> xr.Dataset:
+def _scan_plan(bench: Bench, frame: Any, settings: SpindleDriftSettings) -> xr.Dataset:
     """Return a beam detection without its samples."""
     g = frame.geometry
     centres, scans = sphere_centres(settings, g.nominal_origin, g.nominal_direction)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ MAX_FAILED_POLLS = 30
 
 
 def record_drift(
-    bench: Bench, settings: Settings, beams: xr.Dataset | None, done: xr.Dataset | None
+    bench: Bench, settings: SpindleDriftSettings, beams: xr.Dataset | None, done: xr.Dataset | None
 ) -> Iterator[xr.Dataset]:
     """Yield the drift record, chunk by chunk along ``time``.
 
@@ -53,7 +53,7 @@ def record_drift(
     ----------
     bench : Bench
         With a ``spindle_frame``; ``controller`` and ``thermometer`` are optional.
-    settings : Settings
+    settings : SpindleDriftSettings
     beams : Dataset, optional
         Error dataset of a beam detection; by default, the nominal beams are used.
     done : Dataset, optional
@@ -97,7 +97,7 @@ def starts_schedules(bench: Bench) -> bool:
     return bench.has_kind("controller") and hasattr(bench.of_kind("controller"), "start")
 
 
-def _start_machine(bench: Bench, settings: Settings, elapsed: float) -> bool:
+def _start_machine(bench: Bench, settings: SpindleDriftSettings, elapsed: float) -> bool:
     """Mount the bar and start the schedule; return whether the machine is virtual, with a time that can be set."""
     if not starts_schedules(bench):
         speeds = ", ".join(
@@ -156,7 +156,7 @@ def warmth(frame: Any, done: xr.Dataset | None) -> int:
     return before
 
 
-def _static(bench: Bench, frame: Any, settings: Settings, beams: xr.Dataset | None) -> xr.Dataset:
+def _static(bench: Bench, frame: Any, settings: SpindleDriftSettings, beams: xr.Dataset | None) -> xr.Dataset:
     """Return a raw dataset without its samples."""
     g = frame.geometry
     labels = {"channel": list(CHANNELS), "direction": list("xyz"), "height": ["L1", "L2"]}
@@ -196,7 +196,7 @@ class _Pending:
 
     static: xr.Dataset
     rate: float
-    settings: Settings
+    settings: SpindleDriftSettings
     end: int
     thermometer: Any
     encoding: Mapping[str, Any]

@@ -14,7 +14,7 @@ from errormotion.methods.spindle_drift.identification.times import first_and_las
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 _ARCSEC = np.degrees(1.0) * 3600.0
@@ -27,7 +27,7 @@ class LiveDrift:
     the whole record afterwards.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SpindleDriftSettings) -> None:
         self._settings = settings
         self._averager = Averager(len(CHANNELS), settings.average, settings.min_valid)
         self._start: float | None = None

@@ -16,10 +16,10 @@ from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.plugins import Step
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
-def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
+def steps(settings: SpindleDriftSettings, instruments: Mapping[str, Any] | None = None) -> list[Step]:
     """Return every step of the machine.
 
     Raises
@@ -30,7 +30,7 @@ def steps(settings: Settings, instruments: Mapping[str, Any] | None = None) -> l
     return _speeds(settings) if settings.procedure == "drift" else _scans(settings, instruments or {})
 
 
-def _speeds(settings: Settings) -> list[Step]:
+def _speeds(settings: SpindleDriftSettings) -> list[Step]:
     """Return the rests of the axes, each with its spindle speed."""
     events = sorted((e.at, e.spindle_speed) for e in settings.schedule if e.spindle_speed is not None)
     times = [0.0, *(min(at, settings.duration) for at, _ in events), settings.duration]
@@ -42,7 +42,7 @@ def _speeds(settings: Settings) -> list[Step]:
     ]
 
 
-def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
+def _scans(settings: SpindleDriftSettings, instruments: Mapping[str, Any]) -> list[Step]:
     frame = instruments.get("spindle_frame")
     origin, direction = getattr(frame, "origin", None), getattr(frame, "direction", None)
     if not (isinstance(origin, Mapping) and isinstance(direction, Mapping) and set(CHANNELS) <= set(origin)):
@@ -64,7 +64,7 @@ def _scans(settings: Settings, instruments: Mapping[str, Any]) -> list[Step]:
     ]
 
 
-def sphere_centres(settings: Settings, origin: Array, direction: Array) -> tuple[Array, Array]:
+def sphere_centres(settings: SpindleDriftSettings, origin: Array, direction: Array) -> tuple[Array, Array]:
     """Return the centres of the sphere (channel, profile, step, 3), m, and the directions of the scans (.., 3)."""
     offsets = np.linspace(-0.5, 0.5, settings.steps) * settings.scan_length
     scans = np.array([[v for _ in settings.depths for v in machine_axes(u)] for u in direction])

@@ -25,13 +25,13 @@ from errormotion.methods.spindle_drift.identification.segmentation import scan_s
 from errormotion.methods.spindle_drift.settings import TrialSettings
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 log = logging.getLogger(__name__)
 
 
-def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+def identify_beams(raw: xr.Dataset, settings: SpindleDriftSettings, method: str, version: str) -> xr.Dataset:
     """Return an error dataset of component ``beam``: each beam minus its nominal beam.
 
     The errors of a beam are stated at its zero point; see `beam_errors` for their definition.
@@ -145,7 +145,7 @@ def identify_beams(raw: xr.Dataset, settings: Settings, method: str, version: st
     return ds.assign_attrs(notes=notes or [""])
 
 
-def segmented(raw: xr.Dataset, settings: Settings, notes: list[str]) -> xr.Dataset:
+def segmented(raw: xr.Dataset, settings: SpindleDriftSettings, notes: list[str]) -> xr.Dataset:
     """Return a beam detection with the mean reading of every step, from one as recorded.
 
     Of a repeated scan the last attempt is used. A scan whose steps are not found is NaN; ``notes`` state the reason.

@@ -14,7 +14,7 @@ from errormotion.methods.spindle_drift.identification.record import Record, sens
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 _MAX_PARTS = 48
@@ -43,7 +43,9 @@ class FrameWarming:
     per_kelvin: Array
 
 
-def frame_warming(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> FrameWarming | None:
+def frame_warming(
+    raw: xr.Dataset, record: Record, settings: SpindleDriftSettings, notes: list[str]
+) -> FrameWarming | None:
     """Return the warming of the frame, None where its expansion is not or cannot be compensated."""
     if not settings.compensate_frame:
         return None

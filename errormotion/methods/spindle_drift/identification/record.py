@@ -40,7 +40,7 @@ from errormotion.methods.spindle_drift.schema import CHANNELS, PLANNED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 _CHANCE = 3.3
@@ -90,7 +90,7 @@ class Record:
     hash: str
 
 
-def average_record(raw: xr.Dataset, settings: Settings) -> Record:
+def average_record(raw: xr.Dataset, settings: SpindleDriftSettings) -> Record:
     """Average and hash a record in one pass and constant memory."""
     slow = [name for name in ("temperature", "spindle_speed") if name in raw and "time" in raw[name].dims]
     # The order is changed after reading: a lazy selection would read the store sample by sample.
@@ -129,7 +129,7 @@ def average_record(raw: xr.Dataset, settings: Settings) -> Record:
     return _at_common_times(record, settings)
 
 
-def without_spikes(record: Record, settings: Settings, notes: list[str]) -> Record:
+def without_spikes(record: Record, settings: SpindleDriftSettings, notes: list[str]) -> Record:
     """Return a record without the means that stand out from those beside them, which are noted.
 
     As many readings as unknowns check nothing: a wrong reading is found by its neighbours in time only. What changes
@@ -152,7 +152,7 @@ def without_spikes(record: Record, settings: Settings, notes: list[str]) -> Reco
     return replace(record, averages=replace(record.averages, mean=mean))
 
 
-def _at_common_times(record: Record, settings: Settings) -> Record:
+def _at_common_times(record: Record, settings: SpindleDriftSettings) -> Record:
     """Return a record whose means are those at the times of their windows, although samples are missing.
 
     The mean of a window without its first third is that at a later time. Each is carried back along the slope of the
@@ -256,7 +256,9 @@ def _pieces(
             yield running.popleft().result()
 
 
-def _scatter(time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: Settings) -> Array | None:
+def _scatter(
+    time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: SpindleDriftSettings
+) -> Array | None:
     """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
     turning = turns(speed)
     start = int(np.argmax(turning))
@@ -287,7 +289,7 @@ def count_unknown(averages: Averages, notes: list[str]) -> None:
 
 
 def reference_windows(
-    averages: Averages, settings: Settings, coming_up: NDArray[np.bool_], notes: list[str]
+    averages: Averages, settings: SpindleDriftSettings, coming_up: NDArray[np.bool_], notes: list[str]
 ) -> NDArray[np.int64]:
     """Return the windows of the reference state; MethodError where there is none with all five readings."""
     mean = averages.mean
@@ -324,12 +326,12 @@ def reference_windows(
     return np.flatnonzero(known)
 
 
-def length_of_means(averages: Averages, settings: Settings) -> float:
+def length_of_means(averages: Averages, settings: SpindleDriftSettings) -> float:
     """Return the time that each mean covers, s; 0 where each is a single reading at its time."""
     return settings.average if averages.expected.max() > 1 else 0.0
 
 
-def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str]) -> Array:
+def noise(raw: xr.Dataset, record: Record, settings: SpindleDriftSettings, notes: list[str]) -> Array:
     """Return the standard uncertainty (5, instant) of the means, m: as stated, or as observed where that is larger."""
     stated = float(raw["distance_noise"])
     averages = record.averages
@@ -354,7 +356,7 @@ def noise(raw: xr.Dataset, record: Record, settings: Settings, notes: list[str])
     return _rounded(np.asarray(sigma * record.weight), record, notes)
 
 
-def slow(record: Record, sigma: Array, settings: Settings, notes: list[str], doubts: list[str]) -> Array:
+def slow(record: Record, sigma: Array, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]) -> Array:
     """Return the standard deviation (5,) of the noise of the means beyond ``sigma`` (5, instant), m, if there is any.
 
     It is alike from mean to mean, or the readings are too few for their second differences.
@@ -371,7 +373,9 @@ def slow(record: Record, sigma: Array, settings: Settings, notes: list[str], dou
     return found.sd
 
 
-def run_out_left(record: Record, stated: float, settings: Settings, notes: list[str], doubts: list[str]) -> Array:
+def run_out_left(
+    record: Record, stated: float, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]
+) -> Array:
     """Return the standard deviation (5,) of the run-out that a mean contains while the spindle turns, m.
 
     A mean over many turns contains none of it, unless samples are taken at nearly the same angles of each turn, or the
@@ -408,7 +412,7 @@ def run_out_left(record: Record, stated: float, settings: Settings, notes: list[
     return found
 
 
-def _abrupt(record: Record, settings: Settings) -> list[float]:
+def _abrupt(record: Record, settings: SpindleDriftSettings) -> list[float]:
     """Return the times at which the readings may change abruptly: changes of the speed, and switched compensations.
 
     The last single reading before a change is the start of the curve that follows. A mean at rest contains the run-out.

@@ -14,7 +14,7 @@ from errormotion.methods.spindle_drift.identification.bar import SIDE
 from errormotion.methods.spindle_drift.schema import CHANNELS
 
 if TYPE_CHECKING:
-    from errormotion.methods.spindle_drift.settings import Settings
+    from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Setup:
     levels: Array
 
     @classmethod
-    def of(cls, raw: xr.Dataset, settings: Settings, notes: list[str]) -> Setup:
+    def of(cls, raw: xr.Dataset, settings: SpindleDriftSettings, notes: list[str]) -> Setup:
         """Return the set-up that a raw dataset states.
 
         Raises
@@ -60,7 +60,7 @@ class Setup:
             )
 
 
-def _beams(raw: xr.Dataset, settings: Settings, notes: list[str]) -> tuple[Array, Array, Array, str]:
+def _beams(raw: xr.Dataset, settings: SpindleDriftSettings, notes: list[str]) -> tuple[Array, Array, Array, str]:
     """Return origins, directions (5, 3), covariance (5, 6, 6) and the budget's name for it."""
     nominal = settings.beams == "nominal"
     if nominal and "nominal_origin" not in raw:

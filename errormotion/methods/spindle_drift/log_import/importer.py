@@ -25,11 +25,11 @@ from errormotion.methods.spindle_drift.log_import.import_map import (
     TimeColumn,
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
-from errormotion.methods.spindle_drift.settings import Settings
+from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 _DRIFT = RAW_SCHEMAS[0]
-_ORIGIN = float(Settings.model_fields["nominal_origin_uncertainty"].default)
-_DIRECTION = float(Settings.model_fields["nominal_direction_uncertainty"].default)
+_ORIGIN = float(SpindleDriftSettings.model_fields["nominal_origin_uncertainty"].default)
+_DIRECTION = float(SpindleDriftSettings.model_fields["nominal_direction_uncertainty"].default)
 _ROWS = {row.name: row for row in _DRIFT.rows}
 _VARIABLE = {"time": "time", "channels": "distance", "temperatures": "temperature", "spindle_speed": "spindle_speed"}
 

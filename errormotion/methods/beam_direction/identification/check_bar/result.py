@@ -18,7 +18,7 @@ from errormotion.methods.beam_direction.identification.check_bar.measure import 
 if TYPE_CHECKING:
     from errormotion.datasets.calibrations.inclination import InclinationCalibration
     from errormotion.methods.beam_direction.identification.sensor import Sensor
-    from errormotion.methods.beam_direction.settings import Settings
+    from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 
 
 log = logging.getLogger(__name__)
@@ -30,7 +30,9 @@ _CONTRADICTION = (
 )
 
 
-def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, method: str, version: str) -> xr.Dataset:
+def identify_bar(
+    raw: xr.Dataset, sensor: Sensor | None, settings: BeamDirectionSettings, method: str, version: str
+) -> xr.Dataset:
     """Return a result with a check bar only; the errors of the beam are NaN.
 
     The beam is that stated in the data, ``nominal_direction`` and ``nominal_origin`` (default: the stage's zero).
@@ -41,7 +43,7 @@ def identify_bar(raw: xr.Dataset, sensor: Sensor | None, settings: Settings, met
         Schema ``errormotion.raw.beam_direction/1``, the check bar alone.
     sensor : Sensor or None
         For the compensation of its readings.
-    settings : Settings
+    settings : BeamDirectionSettings
     method, version : str
 
     Raises
@@ -99,7 +101,7 @@ def bar_extras(
     covariance: Array | None,
     calibration: InclinationCalibration | None,
     moves: Literal["sensor", "target"],
-    settings: Settings,
+    settings: BeamDirectionSettings,
     notes: list[str],
 ) -> dict[str, xr.DataArray]:
     """Return the check bar of a raw dataset, measured with a beam; remarks are appended to ``notes``."""

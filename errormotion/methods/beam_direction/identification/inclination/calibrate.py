@@ -60,7 +60,7 @@ _SIGNIFICANT = 3.0
 """Standard uncertainties from which on a deviation of the mid-range from the stated one is reported."""
 
 
-class Settings(BaseModel):
+class InclinationCalibrationSettings(BaseModel):
     """Settings of a calibration."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -86,14 +86,14 @@ class Settings(BaseModel):
     serial_number: str = Field(default="", description="serial number of the sensor; default: that of the readings")
 
 
-def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationCalibration:
+def calibrate(raw: xr.Dataset, settings: InclinationCalibrationSettings | None = None) -> InclinationCalibration:
     """Return the calibration from readings.
 
     Parameters
     ----------
     raw : Dataset
         Of the schema ``errormotion.raw.inclination/1``.
-    settings : Settings, optional
+    settings : InclinationCalibrationSettings, optional
 
     Returns
     -------
@@ -107,7 +107,7 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     MethodError
         Implausible readings, no direction of rotation 0, or too few settings.
     """
-    settings = settings or Settings()
+    settings = settings or InclinationCalibrationSettings()
     if raw.attrs.get("schema") != INCLINATION_SCHEMA:
         raise MethodError(
             f"Expected readings of the schema {INCLINATION_SCHEMA}; found {raw.attrs.get('schema', 'none')}.",
@@ -135,13 +135,13 @@ def calibrate(raw: xr.Dataset, settings: Settings | None = None) -> InclinationC
     return InclinationCalibration(calibration.dataset.assign_attrs(notes="\n".join(notes)))
 
 
-def _serial_number(raw: xr.Dataset, settings: Settings) -> dict[str, str]:
+def _serial_number(raw: xr.Dataset, settings: InclinationCalibrationSettings) -> dict[str, str]:
     """Return the attribute with the serial number of the calibrated sensor; empty if it is unknown."""
     serial = settings.serial_number or owner.serial_number(raw.attrs, "point_lds")
     return {owner.ATTRIBUTE: serial} if serial else {}
 
 
-def _surface(q: Array, lines: Lines, settings: Settings) -> tuple[NDArray[np.bool_], Surface]:
+def _surface(q: Array, lines: Lines, settings: InclinationCalibrationSettings) -> tuple[NDArray[np.bool_], Surface]:
     """Return which settings were used, without those that contradict the others, and the surface fitted to them."""
     different = len(np.unique(np.round(q, 6), axis=0))
     fits = [

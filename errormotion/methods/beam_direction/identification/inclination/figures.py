@@ -5,7 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from errormotion.methods.beam_direction.identification.inclination.calibrate import Settings, calibrate, counted
+from errormotion.methods.beam_direction.identification.inclination.calibrate import (
+    InclinationCalibrationSettings,
+    calibrate,
+    counted,
+)
 from errormotion.methods.beam_direction.schema import INCLINATION_SCHEMA
 from errormotion.plugins import Calibration
 
@@ -56,9 +60,9 @@ def text(calibration: xr.Dataset) -> list[str]:
     ]
 
 
-def _make(raw: xr.Dataset, settings: Settings) -> xr.Dataset:
+def _make(raw: xr.Dataset, settings: InclinationCalibrationSettings) -> xr.Dataset:
     return calibrate(raw, settings).dataset
 
 
-CALIBRATIONS = {INCLINATION_SCHEMA: Calibration(Settings, _make, figures, text)}
+CALIBRATIONS = {INCLINATION_SCHEMA: Calibration(InclinationCalibrationSettings, _make, figures, text)}
 """The calibrations of the method, by the schema of their readings."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.random import Generator
 
     from errormotion.arrays import Array
-    from errormotion.methods.crossbeam_scan.settings import PoseSettings, Settings
+    from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings, PoseSettings
 
 RADIUS_UNCERTAINTY = 1e-6
 """Standard uncertainty of the radius of a pocket, m, where the data state none."""
@@ -36,7 +36,7 @@ def stated_covariance(pose: PoseSettings) -> np.ndarray:
     return np.diag([pose.angle_uncertainty] * 3 + [pose.place_uncertainty] * 3) ** 2
 
 
-def identify_pose(raw: xr.Dataset, settings: Settings, method: str, version: str) -> xr.Dataset:
+def identify_pose(raw: xr.Dataset, settings: CrossbeamScanSettings, method: str, version: str) -> xr.Dataset:
     """Return the pose of the profiler from scans of a pocket: variant "profiler pose" of the raw dataset.
 
     The errors are those of one beam, ``profiler``: actual minus nominal pose in the tool frame, at the nominal origin.
@@ -103,7 +103,7 @@ def _sensitivity(p: np.ndarray, nominal: RigidTransform) -> np.ndarray:
     return np.asarray((up - down) / 2e-6)
 
 
-def redrawing(raw: xr.Dataset, settings: Settings) -> Redrawing:
+def redrawing(raw: xr.Dataset, settings: CrossbeamScanSettings) -> Redrawing:
     """Return the scans of a pocket with their sources for the Monte Carlo method: lines, radius and centre.
 
     The scans state no noise. Their lines are drawn with replacement, which reproduces their scatter.
@@ -116,7 +116,9 @@ def redrawing(raw: xr.Dataset, settings: Settings) -> Redrawing:
     return Redrawing(raw.load(), settings, sources)
 
 
-def _lines(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+def _lines(
+    raw: xr.Dataset, settings: CrossbeamScanSettings, generator: Generator
+) -> tuple[xr.Dataset, CrossbeamScanSettings]:
     """Return every scan with the same number of its lines, drawn with replacement."""
     scans = []
     for number in range(raw.sizes["scan"]):
@@ -127,7 +129,9 @@ def _lines(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[x
 
 
 def _shift(name: str, uncertainty: Array | float) -> Redraw:
-    def draw(raw: xr.Dataset, settings: Settings, generator: Generator) -> tuple[xr.Dataset, Settings]:
+    def draw(
+        raw: xr.Dataset, settings: CrossbeamScanSettings, generator: Generator
+    ) -> tuple[xr.Dataset, CrossbeamScanSettings]:
         value = raw[name]
         change = uncertainty * generator.normal(size=value.shape)
         return raw.assign({name: value.copy(data=value.values + change)}), settings
