@@ -15,10 +15,14 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
+from errormotion import plugins
 from errormotion.datasets import clock
 from errormotion.datasets.files.hashing import hash_dataset, plain
 
 __all__ = ["hash_dataset", "identity", "make", "of", "plain"]
+
+IMPORTED = "imported"
+"""Attribute of raw data that were not acquired by errormotion: the names of their files."""
 
 _PACKAGES = ("errormotion", "numpy", "scipy", "xarray", "zarr", "h5netcdf", "numba")
 
@@ -36,7 +40,7 @@ def make(
     Parameters
     ----------
     settings : BaseModel or mapping
-        Effective settings, including defaults.
+        Effective settings, including defaults; for imported data those of `of_evaluation`.
     raw : Dataset or None
         The raw data, whose hash is stored.
     instruments : sequence of mapping or None
@@ -57,7 +61,7 @@ def make(
         instruments = json.loads(raw.attrs["instruments"])
     interrupted = clock.notes(raw.attrs) if raw is not None else []
     return {
-        "settings": plain(settings),
+        "settings": plain(settings if raw is None or IMPORTED not in raw.attrs else of_evaluation(settings, raw)),
         "raw": None
         if raw is None
         else {"schema": str(raw.attrs.get("schema", "")), "hash": raw_hash or hash_dataset(raw)},
@@ -66,6 +70,15 @@ def make(
         "seed": seed,
         "steps": plain(steps),
     } | ({"interruptions": interrupted} if interrupted else {})
+
+
+def of_evaluation(settings: BaseModel | Mapping[str, Any], raw: xr.Dataset) -> BaseModel | Mapping[str, Any]:
+    """Return settings without those of the acquisition that nobody stated: their defaults never applied."""
+    owner = plugins.owner_of_schema(str(raw.attrs.get("schema", "")))
+    if not isinstance(settings, BaseModel) or owner is None or not issubclass(owner, plugins.Method):
+        return settings
+    unused = {*owner.acquisition_settings} - settings.model_fields_set
+    return {name: each for name, each in settings.model_dump(mode="json").items() if name not in unused}
 
 
 def identity(*calibrated: ArrayLike | str, part: str, along: ArrayLike = ()) -> str:

@@ -92,6 +92,8 @@ class Method(Owner):
     info: ClassVar[MethodInfo]
     needs: ClassVar[Needs]
     Settings: ClassVar[type[PluginSettings]]
+    acquisition_settings: ClassVar[Sequence[str]] = ()
+    """Settings that only `acquire`, `plan` and programs use; results of imported data list them only if stated."""
     doctor: ClassVar[Mapping[str, Callable[[], str]]] = _NONE
     """Checks of this computer for ``errormotion doctor``; each returns a text or raises an error."""
 

@@ -11,7 +11,7 @@ from errormotion.methods.beam_direction.settings import BeamDirectionSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -34,6 +34,7 @@ class BeamDirection(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds", "controller"), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = BeamDirectionSettings
+    acquisition_settings: ClassVar[Sequence[str]] = ("planes",)
     raw_schemas = lazy("errormotion.methods.beam_direction.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.beam_direction.report:chapters")
     texts = lazy("errormotion.methods.beam_direction.report:texts")

@@ -6,6 +6,7 @@ radius is not removed: it compares the scales of the machine with the calibrated
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -48,6 +49,16 @@ class CircularTest(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=(), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = CircularTestSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "plane",
+        "centre",
+        "nominal_radius",
+        "feed",
+        "runs",
+        "samples",
+        "length_noise",
+        "length_uncertainty",
+    )
     raw_schemas = lazy("errormotion.methods.circular_test.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.circular_test.conformance:subjects")
     chapters = lazy("errormotion.methods.circular_test.report:chapters")

@@ -10,7 +10,7 @@ from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -36,6 +36,30 @@ class CrossbeamScan(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("line_profiler",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = CrossbeamScanSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "procedure",
+        "positions",
+        "scan_length",
+        "line_pitch",
+        "warm_up",
+        "cold_repeats",
+        "measuring_feed",
+        "warm_up_feed",
+        "warm_up_travel",
+        "margin",
+        "travel",
+        "scan_z",
+        "encoder_pitch",
+        "encoder_zero",
+        "height_noise",
+        "pocket_position",
+        "pocket_z",
+        "pocket_radius",
+        "pocket_radius_uncertainty",
+        "pocket_lifts",
+        "pocket_scan_length",
+        "layout",
+    )
     raw_schemas = lazy("errormotion.methods.crossbeam_scan.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.crossbeam_scan.report:chapters")
     texts = lazy("errormotion.methods.crossbeam_scan.report:texts")

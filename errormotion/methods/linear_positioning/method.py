@@ -11,7 +11,7 @@ from errormotion.methods.linear_positioning.settings import LIMITS, LinearPositi
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -39,6 +39,28 @@ class LinearPositioning(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("controller",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = LinearPositioningSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "axis",
+        "freedoms",
+        "travel",
+        "limits",
+        "targets",
+        "count",
+        "random_part",
+        "seed",
+        "runs",
+        "moving",
+        "diagonals",
+        "start",
+        "overrun",
+        "feed",
+        "dwell",
+        "settle",
+        "channels",
+        "average",
+        "arrival",
+        "timeout",
+    )
     raw_schemas = lazy("errormotion.methods.linear_positioning.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.linear_positioning.report:chapters")
     texts = lazy("errormotion.methods.linear_positioning.report:texts")

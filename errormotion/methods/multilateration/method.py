@@ -10,7 +10,7 @@ from errormotion.methods.multilateration.settings import MultilaterationSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, Step, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -37,6 +37,11 @@ class Multilateration(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("laser_tracker",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = MultilaterationSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "layout",
+        "planning",
+        "measuring",
+    )
     raw_schemas = lazy("errormotion.methods.multilateration.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.multilateration.report:chapters")
     texts = lazy("errormotion.methods.multilateration.report:texts")

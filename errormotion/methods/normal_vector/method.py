@@ -10,7 +10,7 @@ from errormotion.methods.normal_vector.settings import NormalVectorSettings
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -39,6 +39,28 @@ class NormalVector(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("touch_probe",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = NormalVectorSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "balls",
+        "touches",
+        "elevation",
+        "order",
+        "tip_radius",
+        "touch_noise",
+        "approach",
+        "overtravel",
+        "clearance",
+        "probing_feed",
+        "positioning_feed",
+        "duration",
+        "interval",
+        "schedule",
+        "moves",
+        "moves_feed",
+        "settle",
+        "to_probe",
+        "to_warm_up",
+        "dwell",
+    )
     raw_schemas = lazy("errormotion.methods.normal_vector.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.normal_vector.report:chapters")
     texts = lazy("errormotion.methods.normal_vector.report:texts")

@@ -64,6 +64,19 @@ class RTest(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("point_lds",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = RTestSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "axis",
+        "angles",
+        "spheres",
+        "radius",
+        "height",
+        "inclination",
+        "noise",
+        "gain_uncertainty",
+        "direction_uncertainty",
+        "position_uncertainty",
+        "nest_uncertainty",
+    )
     raw_schemas = lazy("errormotion.methods.r_test.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.r_test.conformance:subjects")
     chapters = lazy("errormotion.methods.r_test.report:chapters")

@@ -10,7 +10,7 @@ from errormotion.methods.spindle_drift.settings import SpindleDriftSettings, Tri
 from errormotion.plugins import Bench, MethodInfo, Needs, PluginSettings, lazy, unarmed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     import xarray as xr
 
@@ -36,6 +36,15 @@ class SpindleDrift(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=("spindle_frame",), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = SpindleDriftSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "procedure",
+        "duration",
+        "sphere_radius",
+        "depths",
+        "scan_length",
+        "steps",
+        "layout",
+    )
     raw_schemas = lazy("errormotion.methods.spindle_drift.schema:RAW_SCHEMAS")
     chapters = lazy("errormotion.methods.spindle_drift.report:chapters")
     texts = lazy("errormotion.methods.spindle_drift.report:texts")

@@ -34,6 +34,23 @@ class SpindleErrorMotion(ModelMethod):
     )
     needs: ClassVar[Needs] = Needs(instruments=(), raw_schema=SCHEMA)
     Settings: ClassVar[type[PluginSettings]] = SpindleErrorMotionSettings
+    acquisition_settings: ClassVar[Sequence[str]] = (
+        "axis",
+        "sensors",
+        "height",
+        "artefact_radius",
+        "spindle_speed",
+        "turns",
+        "sample_rate",
+        "angle_from",
+        "noise",
+        "asynchronous",
+        "eccentricity",
+        "gain_uncertainty",
+        "direction_uncertainty",
+        "position_uncertainty",
+        "roundness",
+    )
     raw_schemas = lazy("errormotion.methods.spindle_error_motion.schema:RAW_SCHEMAS")
     conformance = lazy("errormotion.methods.spindle_error_motion.conformance:subjects")
     chapters = lazy("errormotion.methods.spindle_error_motion.report:chapters")
