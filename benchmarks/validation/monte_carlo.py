@@ -36,7 +36,7 @@ def section(seeds: int, workers: int = 1) -> Iterator[str]:
     yield from ("", "| method | trials | freedom | u ratio | difference | verdict |", "|---|---|---|---|---|---|")
     for plugin in plugins.available("methods"):
         for subject in subjects_of("methods", plugin.id):
-            if hasattr(subject.plugin, "redrawing"):
+            if hasattr(subject.plugin, "trial_model"):
                 yield from _rows(subject, seeds, workers)
 
 

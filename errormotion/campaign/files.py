@@ -546,9 +546,9 @@ def _trials_mistakes(test: TestTable, place: tuple[str | int, ...]) -> list[str]
         method = plugins.get("methods", test.method)
     except PluginError:
         return []  # reported with its settings
-    if plugins.states(method, "redrawing"):
+    if plugins.states(method, "trial_model"):
         return []
-    return [f"{where}: the method '{test.method}' does not support the Monte Carlo evaluation (it has no 'redrawing')"]
+    return [f"{where}: the method '{test.method}' does not support the Monte Carlo evaluation (no 'trial_model')"]
 
 
 def _settings(

@@ -24,15 +24,15 @@ from errormotion.estimation.sources import errors_of
 from errormotion.kinematics.iso import DOF
 from errormotion.measurement.identification import Solved, dataset, related, solve, values_of
 from errormotion.measurement.observed import Model, Observed, as_expected
-from errormotion.plugins import MethodInfo, Redraw, Redrawing, replaced
+from errormotion.plugins import MethodInfo, RandomSource, TrialModel, replaced
 
-__all__ = ["READINGS", "independent_draws", "moved", "redrawing", "simulate", "standard_draw"]
+__all__ = ["READINGS", "independent_draws", "moved", "simulate", "standard_draw", "trial_model"]
 
 READINGS = "readings"
 """The name of the noise among the sources."""
 
 
-def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> Redrawing:
+def trial_model(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> TrialModel:
     """Return the readings of raw data and all sources of the model; each trial is a fit of arrays, of values only."""
     solved = solve(model.observe(raw, settings))
     result = dataset(model, solved, raw, info, provenance.make(settings, None, None, steps=["trial"]))
@@ -44,7 +44,7 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
     weighed = replace(problem, noise=replace(solved.white.problem.noise, stated=True))
     start = xr.Dataset({READINGS: (("reading", "number"), readings)})
     root, freedom = _noise(solved)
-    sources: dict[str, Redraw] = {}
+    sources: dict[str, RandomSource] = {}
 
     def noisy(data: xr.Dataset, its: Any, generator: np.random.Generator) -> tuple[xr.Dataset, Any]:
         size = 1.0 if np.isinf(freedom) else float(np.sqrt(freedom / generator.chisquare(freedom)))
@@ -55,10 +55,10 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
 
     groups = {source.group for source in solved.relative.errors.sources}
     of_readings = {observed.shared, *((observed.datum.group,) if observed.datum is not None else ())}
-    sources[READINGS] = Redraw(noisy, groups=tuple(sorted(of_readings & groups)), own=True)
+    sources[READINGS] = RandomSource(noisy, groups=tuple(sorted(of_readings & groups)), own=True)
     numbers = independent_draws(problem)
     for name, number in numbers.items():
-        sources[name] = Redraw(standard_draw(name, number), groups=(name,) if name in groups else ())
+        sources[name] = RandomSource(standard_draw(name, number), groups=(name,) if name in groups else ())
 
     def trial(data: xr.Dataset, _settings: Any) -> xr.Dataset:
         drawn = {name: np.asarray(data[name].values) for name in numbers if name in data}
@@ -66,7 +66,7 @@ def redrawing(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) ->
         found = solve(replace(frozen, problem=changed), sources=False, start=solved.fit.linear.at)
         return replaced(result, values_of(found))
 
-    return Redrawing(start, settings, sources, identify=trial)
+    return TrialModel(start, settings, sources, identify=trial)
 
 
 def simulate(model: Model, settings: Any, seed: int, info: MethodInfo) -> tuple[xr.Dataset, xr.Dataset]:

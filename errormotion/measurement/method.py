@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from errormotion.estimation.datum import Relative
     from errormotion.estimation.fit import Fit
     from errormotion.measurement.observed import Observed
-    from errormotion.plugins import Bench, Redrawing
+    from errormotion.plugins import Bench, TrialModel
 
 __all__ = ["ModelMethod"]
 
@@ -64,12 +64,12 @@ class ModelMethod(Method):
 
         return plan(self, settings or self.Settings(), self.info)
 
-    def redrawing(self, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> Redrawing:  # noqa: ARG002
+    def trial_model(self, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> TrialModel:  # noqa: ARG002
         """Return the sources of the uncertainty of raw data, for the Monte Carlo evaluation."""
         from errormotion.datasets.validation import checked_raw
-        from errormotion.measurement.drawing import redrawing
+        from errormotion.measurement.drawing import trial_model
 
-        return redrawing(self, checked_raw(raw, self), settings, self.info)
+        return trial_model(self, checked_raw(raw, self), settings, self.info)
 
     def simulate(self, settings: Any, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return raw data with every source of the model drawn once, and the true errors."""

@@ -27,10 +27,10 @@ from errormotion.montecarlo.intervals import min_samples
 from errormotion.montecarlo.places import chosen_places
 from errormotion.montecarlo.result import build
 from errormotion.montecarlo.store import Store
-from errormotion.montecarlo.trials import linear_uncertainty, redrawing_of, sample, values_of
+from errormotion.montecarlo.trials import linear_uncertainty, sample, trial_model_of, values_of
 from errormotion.montecarlo.validation import UNDECIDED, validate_linear
 from errormotion.parallel import Workers, one_thread_at_a_time
-from errormotion.plugins import Redrawing
+from errormotion.plugins import TrialModel
 
 PROBABILITY = 0.95
 CHUNK = 20
@@ -175,7 +175,7 @@ def evaluate(
     Raises
     ------
     MethodError
-        The method has no redrawing, the number of trials is too small, or no trial had a result.
+        The method has no trial model, the number of trials is too small, or no trial had a result.
     RunError
         The folder contains trials of another evaluation, or the scheduler does not work.
     """
@@ -193,7 +193,7 @@ def evaluate(
     method = plugins.get("methods", method_id)
     common = (str(Path(raw).resolve()), method_id, method.info.version, settings.model_dump_json(), __version__)
     with _quiet():
-        redrawing = _prepared(*common[:4])[1]
+        trial_model = _prepared(*common[:4])[1]
     rows, where = chosen_places(errors)
     linear, u = values_of(errors)[rows], linear_uncertainty(errors)[rows]
     store = Store(folder, _key(errors, common, seed))
@@ -220,7 +220,7 @@ def evaluate(
             code="monte_carlo.no_values",
         )
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
-    found = build(errors, where, linear, u, summary, verdict, seed, list(redrawing.sources), run.reasons)
+    found = build(errors, where, linear, u, summary, verdict, seed, list(trial_model.sources), run.reasons)
     if not keep:
         store.remove()
     return found
@@ -260,27 +260,27 @@ def compute(*task: Any) -> tuple[Array, dict[str, int]]:
                 code="package.version.differs",
             )
     with _quiet():
-        method, redrawing, shape = _prepared(given.raw, given.method_id, given.method_version, given.settings)
+        method, trial_model, shape = _prepared(given.raw, given.method_id, given.method_version, given.settings)
         sequence = SeedSequence(given.seed, spawn_key=(given.block,))
         with _identify_lock if one_thread_at_a_time() else nullcontext():
-            values, reasons = sample(method, redrawing, sequence, range(given.first, given.stop), shape)
+            values, reasons = sample(method, trial_model, sequence, range(given.first, given.stop), shape)
     return values[:, list(given.rows)].reshape(len(values), -1), reasons
 
 
-def _prepared(raw: str, method_id: str, method_version: str, settings: str) -> tuple[Any, Redrawing, tuple[int, int]]:
-    """Return method, redrawing and (places, freedoms), computed once in each process."""
+def _prepared(raw: str, method_id: str, method_version: str, settings: str) -> tuple[Any, TrialModel, tuple[int, int]]:
+    """Return method, trial model and (places, freedoms), computed once in each process."""
     with _prepare_lock:
         return _prepare(raw, method_id, method_version, settings)
 
 
 @lru_cache(maxsize=1)
-def _prepare(raw: str, method_id: str, _method_version: str, settings: str) -> tuple[Any, Redrawing, tuple[int, int]]:
+def _prepare(raw: str, method_id: str, _method_version: str, settings: str) -> tuple[Any, TrialModel, tuple[int, int]]:
     plugin = plugins.get("methods", method_id)
     method, chosen = plugin(), plugin.Settings.model_validate_json(settings)
     with reading(raw), datasets.load(raw) as dataset:
         errors = method.identify(dataset, chosen)
-        redrawing = redrawing_of(method, dataset, chosen, errors)
-    return method, redrawing, (values_of(errors).shape[0], values_of(errors).shape[1])
+        trial_model = trial_model_of(method, dataset, chosen, errors)
+    return method, trial_model, (values_of(errors).shape[0], values_of(errors).shape[1])
 
 
 def _missing(ready: list[range], size: int) -> Iterator[range]:

@@ -11,7 +11,7 @@ from numpy.random import SeedSequence
 
 from errormotion.arrays import Array
 from errormotion.errors import ErrormotionError, MethodError
-from errormotion.plugins import Redrawing, states
+from errormotion.plugins import TrialModel, states
 
 MAX_DIFFERENCE = 1e-2
 """Largest difference between the results of reduced and measured data, in standard uncertainties."""
@@ -19,20 +19,20 @@ ROUNDING = 1e-12
 """Largest difference between these results for values without uncertainty, m or rad."""
 
 
-def redrawing_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> Redrawing:
-    """Return the redrawing of a method: data, settings, and how the sources are drawn.
+def trial_model_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> TrialModel:
+    """Return the trial model of a method: data, settings, and how the sources are drawn.
 
     Raises
     ------
     MethodError
-        The method has no redrawing, or the result of its reduced data is not that of the measured data.
+        The method has no trial model, or the result of its reduced data is not that of the measured data.
     """
-    found: Redrawing | None = method.redrawing(raw, settings, errors) if states(method, "redrawing") else None
+    found: TrialModel | None = method.trial_model(raw, settings, errors) if states(method, "trial_model") else None
     if found is None:
         raise MethodError(
             f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it has "
-            "no 'redrawing'. Its linear uncertainty is not affected.",
-            code="monte_carlo.method.no_redrawing",
+            "no 'trial_model'. Its linear uncertainty is not affected.",
+            code="monte_carlo.method.no_trial_model",
         )
     check_centre((found.identify or method.identify)(found.raw, found.settings), errors)
     return found
@@ -44,8 +44,8 @@ def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:
     if one.shape != other.shape:
         raise MethodError(
             f"The result has {one.shape[0]} places from the reduced data and {other.shape[0]} from the measured data; "
-            "expected the same number. This is a defect of the redrawing of the method.",
-            code="monte_carlo.redrawing.places",
+            "expected the same number. This is a defect of the trial model of the method.",
+            code="monte_carlo.trial_model.places",
         )
     u = linear_uncertainty(errors)
     known = np.isfinite(other)
@@ -53,8 +53,8 @@ def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:
     if wrong := int((known & (off | ~np.isfinite(one))).sum()):
         raise MethodError(
             f"The results from the reduced data and from the measured data differ at {wrong} of {int(known.sum())} "
-            "places and freedoms. This is a defect of the redrawing of the method.",
-            code="monte_carlo.redrawing.values",
+            "places and freedoms. This is a defect of the trial model of the method.",
+            code="monte_carlo.trial_model.values",
         )
 
 
@@ -75,32 +75,32 @@ def linear_uncertainty(errors: xr.Dataset) -> Array:
         return np.asarray(np.sqrt(np.diagonal(C, axis1=-2, axis2=-1)).reshape(-1, C.shape[-1]))
 
 
-def trial(method: Any, redrawing: Redrawing, sequence: SeedSequence, only: Iterable[str] | None = None) -> xr.Dataset:
+def trial(method: Any, model: TrialModel, sequence: SeedSequence, only: Iterable[str] | None = None) -> xr.Dataset:
     """Return the error dataset of one trial.
 
     Every source has its own generator, so that the draws of a source do not depend on which other sources are active
     (``only`` states the active ones).
     """
-    active = set(redrawing.sources if only is None else only)
-    raw, settings = redrawing.raw, redrawing.settings
+    active = set(model.sources if only is None else only)
+    raw, settings = model.raw, model.settings
     generators = {
         name: np.random.default_rng(SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, number)))
-        for number, name in enumerate(redrawing.sources)
+        for number, name in enumerate(model.sources)
         if name in active
     }
     for name, generator in generators.items():
-        if (draw := redrawing.sources[name].draw) is not None:
+        if (draw := model.sources[name].draw) is not None:
             raw, settings = draw(raw, settings, generator)
-    errors: xr.Dataset = (redrawing.identify or method.identify)(raw, settings)
+    errors: xr.Dataset = (model.identify or method.identify)(raw, settings)
     for name, generator in generators.items():
-        if (act := redrawing.sources[name].act) is not None:
+        if (act := model.sources[name].act) is not None:
             errors = act(errors, generator)
     return errors
 
 
 def sample(
     method: Any,
-    redrawing: Redrawing,
+    trial_model: TrialModel,
     sequence: SeedSequence,
     trials: range,
     shape: tuple[int, int],
@@ -111,7 +111,7 @@ def sample(
     Parameters
     ----------
     method : Method
-    redrawing : Redrawing
+    trial_model : TrialModel
     sequence : SeedSequence
         Seed of the block; the seed of a trial follows from its number.
     trials : range
@@ -125,7 +125,7 @@ def sample(
     for row, number in enumerate(trials):
         own = SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, number))
         try:
-            values = values_of(trial(method, redrawing, own, only))
+            values = values_of(trial(method, trial_model, own, only))
         except ErrormotionError as error:
             reason = str(error).splitlines()[0]
         else:

@@ -31,7 +31,6 @@ from errormotion.plugins.contracts import (
 from errormotion.plugins.kind_registry import contract
 from errormotion.plugins.lazy import lazy, load_object
 from errormotion.plugins.readings import Environment, FrameGeometry, Measurement, Profiles, Scan
-from errormotion.plugins.redrawing import Redraw, Redrawing, replaced
 from errormotion.plugins.registry import (
     GROUPS,
     Group,
@@ -46,6 +45,7 @@ from errormotion.plugins.registry import (
     refresh,
 )
 from errormotion.plugins.subjects import CompensatorSubject, InstrumentSubject, MethodSubject
+from errormotion.plugins.trial_model import RandomSource, TrialModel, replaced
 
 __all__ = [
     "ERRORS_SCHEMA",
@@ -76,13 +76,13 @@ __all__ = [
     "Plugin",
     "PluginSettings",
     "Profiles",
-    "Redraw",
-    "Redrawing",
+    "RandomSource",
     "Samples",
     "Scan",
     "Status",
     "Step",
     "Touch",
+    "TrialModel",
     "available",
     "brought",
     "contract",

@@ -30,7 +30,7 @@ from errormotion.plugins.contracts import (
 
 if TYPE_CHECKING:
     from errormotion.kinematics.description import MachineDescription
-    from errormotion.plugins.redrawing import Redrawing
+    from errormotion.plugins.trial_model import TrialModel
 
 __all__ = ["DatasetPlugin", "Method", "Owner", "adapted", "states"]
 
@@ -184,7 +184,7 @@ class Method(Owner):
 
     # Trust in the results
 
-    def redrawing(self, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> Redrawing | None:  # noqa: ARG002
+    def trial_model(self, raw: xr.Dataset, settings: Any, errors: xr.Dataset) -> TrialModel | None:  # noqa: ARG002
         """Return the sources of the uncertainty of raw data, for ``identify --monte-carlo``.
 
         ``errors`` is the result of `identify`.

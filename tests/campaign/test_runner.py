@@ -396,11 +396,11 @@ def test_a_test_may_evaluate_its_result_by_trials(plan: Plan) -> None:
 
 def test_a_failed_evaluation_does_not_affect_the_measurement(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     campaign = plan('name = "a"\nmonte_carlo = 60')
-    monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+    monkeypatch.delattr(plugins.get("methods", "ramp"), "trial_model")
     (folder,) = runner.run(campaign)
     assert folder.finished
     assert folder.data["steps"][-1]["outcome"] == "failed"
-    assert "redrawing" in folder.data["steps"][-1]["reason"]
+    assert "trial_model" in folder.data["steps"][-1]["reason"]
 
 
 @pytest.mark.parametrize(
@@ -415,7 +415,7 @@ def test_an_impossible_evaluation_is_an_error(
     plan: Plan, monkeypatch: pytest.MonkeyPatch, key: str, message: str
 ) -> None:
     if key == "60":
-        monkeypatch.delattr(plugins.get("methods", "ramp"), "redrawing")
+        monkeypatch.delattr(plugins.get("methods", "ramp"), "trial_model")
     with pytest.raises(BenchError, match=message):
         plan(f'name = "a"\nmonte_carlo = {key}')
 

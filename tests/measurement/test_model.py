@@ -24,7 +24,7 @@ from errormotion.estimation.sources import Places
 from errormotion.measurement import ModelMethod, Observed
 from errormotion.measurement.drawing import READINGS
 from errormotion.measurement.identification import Solved
-from errormotion.montecarlo.trials import redrawing_of, trial, values_of
+from errormotion.montecarlo.trials import trial, trial_model_of, values_of
 from errormotion.plugins import MethodInfo, Needs, PluginSettings
 from errormotion.report.provenance import simulated
 
@@ -187,13 +187,13 @@ def test_plan_and_identification_have_the_same_sources() -> None:
 def test_monte_carlo_agrees_with_the_linear_uncertainty() -> None:
     raw, _ = METHOD.simulate(SETTINGS, 2)
     errors = METHOD.identify(raw, SETTINGS)
-    redrawing = redrawing_of(METHOD, raw, SETTINGS, errors)
-    assert list(redrawing.sources) == [READINGS, "gain"]
-    values = np.array([values_of(trial(METHOD, redrawing, np.random.SeedSequence(7, spawn_key=(k,))))[:, 2]
+    trial_model = trial_model_of(METHOD, raw, SETTINGS, errors)
+    assert list(trial_model.sources) == [READINGS, "gain"]
+    values = np.array([values_of(trial(METHOD, trial_model, np.random.SeedSequence(7, spawn_key=(k,))))[:, 2]
                        for k in range(300)])  # fmt: skip
     u = np.sqrt(errors["covariance"].values[1:, 2, 2])
     assert values[:, 1:].std(axis=0) == pytest.approx(u, rel=0.15)
-    only = [values_of(trial(METHOD, redrawing, np.random.SeedSequence(7, spawn_key=(k,)), only=["gain"]))[-1, 2]
+    only = [values_of(trial(METHOD, trial_model, np.random.SeedSequence(7, spawn_key=(k,)), only=["gain"]))[-1, 2]
             for k in range(100)]  # fmt: skip
     assert np.std(only) == pytest.approx(SETTINGS.gain * errors["EZ"].values[-1], rel=0.25)
 
@@ -274,9 +274,9 @@ def test_what_follows_from_a_solution_is_part_of_result_plan_and_trials() -> Non
     errors = method.identify(raw, SETTINGS)
     assert float(errors["largest"]) == float(errors["EZ"].max())
     assert "largest" in method.plan(SETTINGS)
-    redrawing = redrawing_of(method, raw, SETTINGS, errors)
-    plain = trial(METHOD, redrawing_of(METHOD, raw, SETTINGS, METHOD.identify(raw, SETTINGS)), SeedSequence(7))
-    found = trial(method, redrawing, SeedSequence(7))
+    trial_model = trial_model_of(method, raw, SETTINGS, errors)
+    plain = trial(METHOD, trial_model_of(METHOD, raw, SETTINGS, METHOD.identify(raw, SETTINGS)), SeedSequence(7))
+    found = trial(method, trial_model, SeedSequence(7))
     assert found["EZ"].values == pytest.approx(plain["EZ"].values + 1e-3, abs=1e-12)
 
 
@@ -284,7 +284,7 @@ def test_a_trial_has_the_values_of_the_identification_of_its_readings() -> None:
     """Of values only, from the solution of the measured readings: the same ones as by all of the identification."""
     raw, _ = METHOD.simulate(SETTINGS, 1)
     errors = METHOD.identify(raw, SETTINGS)
-    drawn = redrawing_of(METHOD, raw, SETTINGS, errors)
+    drawn = trial_model_of(METHOD, raw, SETTINGS, errors)
     draw = drawn.sources[READINGS].draw
     assert draw is not None
     assert drawn.identify is not None

@@ -20,7 +20,7 @@ from errormotion.montecarlo.places import PLACES, chosen_places
 from errormotion.montecarlo.report import chapters, texts
 from errormotion.montecarlo.result import SCHEMA, lines
 from errormotion.montecarlo.store import Store
-from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, RandomSource, TrialModel
 from errormotion.report.document import Source
 
 pytestmark = pytest.mark.usefixtures("translated")
@@ -64,15 +64,15 @@ class Straight(Method):
             result.variables[name].values[:] = raw["reading"].values[:, k]
         return result
 
-    def redrawing(self, raw, settings, errors):
+    def trial_model(self, raw, settings, errors):
         def noise(raw, settings, generator):
             return _shifted(raw, generator.normal(0, NOISE, raw["reading"].shape)), settings
 
         def offset(raw, settings, generator):
             return _shifted(raw, generator.normal(0, OFFSET)), settings
 
-        return Redrawing(
-            raw.load(), settings, {"noise": Redraw(noise, own=True), "offset": Redraw(offset, ("sensor",))}
+        return TrialModel(
+            raw.load(), settings, {"noise": RandomSource(noise, own=True), "offset": RandomSource(offset, ("sensor",))}
         )
 
 
@@ -210,14 +210,14 @@ def test_invalid_options_are_an_error(measured, tmp_path, options, message):
         _evaluate(measured, tmp_path / "trials", **options)
 
 
-def test_a_method_without_redrawing_is_refused(measured):
+def test_a_method_without_trial_model_is_refused(measured):
     _, method, settings, errors = measured
 
     class Plain(Method):
         info = method.info
 
-    with raises("monte_carlo.method.no_redrawing"):
-        trials.redrawing_of(Plain(), None, settings, errors)
+    with raises("monte_carlo.method.no_trial_model"):
+        trials.trial_model_of(Plain(), None, settings, errors)
 
 
 def test_reduced_data_with_other_values_are_a_defect(measured):
@@ -225,12 +225,12 @@ def test_reduced_data_with_other_values_are_a_defect(measured):
     raw = datasets.load(path).load()
 
     class Shifted(method):
-        def redrawing(self, raw, settings, errors):
+        def trial_model(self, raw, settings, errors):
             scaled = raw.assign(reading=raw["reading"] + 1e-5)
-            return Redrawing(scaled, settings, {})
+            return TrialModel(scaled, settings, {})
 
-    with raises("monte_carlo.redrawing.values"):
-        trials.redrawing_of(Shifted(), raw, settings, errors)
+    with raises("monte_carlo.trial_model.values"):
+        trials.trial_model_of(Shifted(), raw, settings, errors)
 
 
 def test_an_omitted_source_does_not_change_the_samples_of_the_others():
@@ -241,7 +241,7 @@ def test_an_omitted_source_does_not_change_the_samples_of_the_others():
         def identify(self, raw, settings):
             return raw
 
-    drawn = Redrawing([], None, {name: Redraw(adds) for name in "abc"})
+    drawn = TrialModel([], None, {name: RandomSource(adds) for name in "abc"})
     whole = trials.trial(Lists(), drawn, SeedSequence(3))
     assert trials.trial(Lists(), drawn, SeedSequence(3), only=["a", "c"]) == [whole[0], whole[2]]
 
@@ -249,10 +249,10 @@ def test_an_omitted_source_does_not_change_the_samples_of_the_others():
 def test_refused_trials_are_counted_and_named(measured, tmp_path, monkeypatch):
     whole = trials.trial
 
-    def refuses(method, redrawing, sequence, only=None):
+    def refuses(method, trial_model, sequence, only=None):
         if sequence.spawn_key[-1] % 5 == 0:
             raise MethodError("no luck")
-        return whole(method, redrawing, sequence, only)
+        return whole(method, trial_model, sequence, only)
 
     monkeypatch.setattr(trials, "trial", refuses)
     found = _evaluate(measured, tmp_path / "trials", scheduler="sync")

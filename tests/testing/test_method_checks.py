@@ -13,7 +13,7 @@ from errormotion import datasets
 from errormotion.datasets.results.merit import last_values
 from errormotion.errors import MethodError
 from errormotion.kinematics.twists import cross_matrix
-from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, Redraw, Redrawing
+from errormotion.plugins import Method, MethodInfo, Needs, PluginSettings, RandomSource, TrialModel
 from errormotion.report.document import Part
 from errormotion.testing import MethodConformance, MethodSubject, run_checks
 from errormotion.testing.checks.method import METHOD_CHECKS
@@ -273,13 +273,13 @@ class PlansOneFreedom(Sound):
         return self.result(planned["time"].values, values, spread, source, point, CHANNELS, settings)
 
 
-class Redrawn(Sound):
+class DrawnSources(Sound):
     """Draws the noise of its readings and the calibration of its sensors."""
 
     calibration = CALIBRATION
     groups = ("calibration",)
 
-    def redrawing(self, raw, settings, errors):
+    def trial_model(self, raw, settings, errors):
         def shifted(size, shape):
             def draw(raw, settings, generator):
                 shift = self.generator(generator).normal(0, size, shape)
@@ -289,9 +289,9 @@ class Redrawn(Sound):
 
         order = raw["displacement"].transpose("channel", "time")
         each, one = order.shape, (order.shape[0], 1)
-        sources = {"noise": Redraw(shifted(settings.noise, each), own=True)}
-        sources["calibration"] = Redraw(shifted(self.calibration, one), groups=self.groups)
-        return Redrawing(raw.assign(displacement=order), settings, sources)
+        sources = {"noise": RandomSource(shifted(settings.noise, each), own=True)}
+        sources["calibration"] = RandomSource(shifted(self.calibration, one), groups=self.groups)
+        return TrialModel(raw.assign(displacement=order), settings, sources)
 
     def generator(self, given):
         return given
@@ -323,16 +323,16 @@ class IsTooSureOfItsFigures(Sound):
         return [replace(each, expanded_uncertainty=each.expanded_uncertainty / 3) for each in last_values(errors)]
 
 
-class RollsItsOwnDice(Redrawn):
+class RollsItsOwnDice(DrawnSources):
     def generator(self, given):
         return np.random.default_rng()
 
 
-class DrawsHalfOfItsCalibration(Redrawn):
+class DrawsHalfOfItsCalibration(DrawnSources):
     calibration = CALIBRATION / 2
 
 
-class ForgetsItsCalibration(Redrawn):
+class ForgetsItsCalibration(DrawnSources):
     groups = ()
 
 
@@ -387,7 +387,7 @@ def test_a_broken_method_fails_exactly_its_check(check, plugin):
 
 
 def test_a_method_that_draws_its_sources_as_stated_passes():
-    results = {result.name: result for result in run_checks(replace(SOUND, plugin=Redrawn, seeds=20))}
+    results = {result.name: result for result in run_checks(replace(SOUND, plugin=DrawnSources, seeds=20))}
     assert [name for name, result in results.items() if not result.ok] == []
     assert not results["sources_as_stated"].skipped
 

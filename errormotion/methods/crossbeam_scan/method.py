@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from errormotion.kinematics.description import MachineDescription
     from errormotion.measurement import Observed
-    from errormotion.plugins import Redrawing
+    from errormotion.plugins import TrialModel
 
 
 class CrossbeamScan(ModelMethod):
@@ -183,11 +183,11 @@ class CrossbeamScan(ModelMethod):
         settings = settings or CrossbeamScanSettings()
         return plan_pose(self.info, settings) if settings.procedure == "profiler_pose" else super().plan(settings)
 
-    def redrawing(self, raw: xr.Dataset, settings: CrossbeamScanSettings, errors: xr.Dataset) -> Redrawing:
+    def trial_model(self, raw: xr.Dataset, settings: CrossbeamScanSettings, errors: xr.Dataset) -> TrialModel:
         """Return the sources of scans, or those of a pocket, for the Monte Carlo evaluation."""
-        from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import redrawing
+        from errormotion.methods.crossbeam_scan.identification.profiler_pose.pose_errors import trial_model
 
-        return redrawing(raw, settings) if "pocket_radius" in raw else super().redrawing(raw, settings, errors)
+        return trial_model(raw, settings) if "pocket_radius" in raw else super().trial_model(raw, settings, errors)
 
     def identify(self, raw: xr.Dataset, settings: CrossbeamScanSettings | None = None) -> xr.Dataset:
         """Return the error dataset of a raw dataset: of component ``Y`` for scans, ``beam`` for scans of a pocket.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from errormotion.kinematics.description import MachineDescription
     from errormotion.measurement import Observed
-    from errormotion.plugins import Redrawing
+    from errormotion.plugins import TrialModel
 
 
 class Multilateration(ModelMethod):
@@ -133,12 +133,12 @@ class Multilateration(ModelMethod):
 
         return expected(settings)
 
-    def redrawing(self, raw: xr.Dataset, settings: MultilaterationSettings, errors: xr.Dataset) -> Redrawing:
+    def trial_model(self, raw: xr.Dataset, settings: MultilaterationSettings, errors: xr.Dataset) -> TrialModel:
         """Return all sources of the model; the repeatability of simultaneous stations displaces the targets."""
         from errormotion.methods.multilateration.readings import latest
         from errormotion.methods.multilateration.repeatability import displaced
 
-        found = super().redrawing(latest(raw), settings, errors)
+        found = super().trial_model(latest(raw), settings, errors)
         return displaced(found, errors) if settings.together and "repeatability" in errors else found
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:

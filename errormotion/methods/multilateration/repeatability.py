@@ -25,7 +25,7 @@ from scipy.special import ndtri
 from errormotion.arrays import Array
 from errormotion.estimation.variance import Verdict
 from errormotion.methods.multilateration.model import XYZ
-from errormotion.plugins import Redraw, Redrawing, replaced
+from errormotion.plugins import RandomSource, TrialModel, replaced
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -172,7 +172,7 @@ def _combined(before: Repeatability, total: float, freedom: int, tracker: float,
     return Repeatability(variance, float(weight.sum() ** -0.5), ("settings", "returns"))
 
 
-def displaced(redrawing: Redrawing, errors: xr.Dataset) -> Redrawing:
+def displaced(trial_model: TrialModel, errors: xr.Dataset) -> TrialModel:
     """Return sources with the repeatability of positions that all stations read at the same time."""
     sd = float(errors["repeatability"])
 
@@ -180,4 +180,4 @@ def displaced(redrawing: Redrawing, errors: xr.Dataset) -> Redrawing:
         shift = sd * generator.standard_normal((3, drawn.sizes["target"]))
         return replaced(drawn, {name: drawn[name].values + d for name, d in zip(XYZ, shift, strict=True)})
 
-    return replace(redrawing, sources={**redrawing.sources, REPEATABILITY: Redraw(act=act, own=True)})
+    return replace(trial_model, sources={**trial_model.sources, REPEATABILITY: RandomSource(act=act, own=True)})

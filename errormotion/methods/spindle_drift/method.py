@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from errormotion.kinematics.description import MachineDescription
     from errormotion.measurement import Observed
-    from errormotion.plugins import Redrawing
+    from errormotion.plugins import TrialModel
 
 
 class SpindleDrift(ModelMethod):
@@ -166,13 +166,13 @@ class SpindleDrift(ModelMethod):
             return plan_beams(its, self.info.id, self.info.version)
         return super().plan(its)
 
-    def redrawing(self, raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> Redrawing:
+    def trial_model(self, raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> TrialModel:
         """Return the sources of the uncertainty of raw data, for the Monte Carlo evaluation."""
         if "sphere_radius" in raw:
-            from errormotion.methods.spindle_drift.redrawing import redrawing_of_beams
+            from errormotion.methods.spindle_drift.trial_model import trial_model_of_beams
 
-            return redrawing_of_beams(raw, settings, errors)
-        return super().redrawing(raw, TrialSettings.of(settings), errors)
+            return trial_model_of_beams(raw, settings, errors)
+        return super().trial_model(raw, TrialSettings.of(settings), errors)
 
 
 def _beam_text(chunk: xr.Dataset) -> str:

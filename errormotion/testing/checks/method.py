@@ -25,7 +25,7 @@ from errormotion.kinematics.iso import DOF
 from errormotion.plugins import MethodInfo, MethodSubject, Needs, kind_registry, states
 from errormotion.testing.checks import shared
 from errormotion.testing.checks.coverage import coverage, differences, figures, no_figures, recovers_truth
-from errormotion.testing.checks.redraw import sources_as_stated, sources_drawn, why_no_redrawing
+from errormotion.testing.checks.draws import sources_as_stated, sources_drawn, why_no_trial_model
 from errormotion.testing.checks.text import chapters_translated, why_no_texts
 from errormotion.testing.kit import Checks, require
 from errormotion.testing.results import covariance, functional_point, names, raw_data, sigma, values
@@ -149,8 +149,8 @@ METHOD_CHECKS.add(limit=60.0)(recovers_truth)
 METHOD_CHECKS.add(limit=300.0)(coverage)
 METHOD_CHECKS.add(limit=300.0)(differences)
 METHOD_CHECKS.add(limit=300.0, why_not=no_figures)(figures)
-METHOD_CHECKS.add(limit=60.0, why_not=why_no_redrawing)(sources_drawn)
-METHOD_CHECKS.add(limit=300.0, why_not=why_no_redrawing)(sources_as_stated)
+METHOD_CHECKS.add(limit=60.0, why_not=why_no_trial_model)(sources_drawn)
+METHOD_CHECKS.add(limit=300.0, why_not=why_no_trial_model)(sources_as_stated)
 METHOD_CHECKS.add(why_not=why_no_texts)(chapters_translated)
 
 

@@ -22,9 +22,9 @@ from errormotion.plugins import (
     MethodInfo,
     Needs,
     PluginSettings,
-    Redraw,
-    Redrawing,
+    RandomSource,
     Samples,
+    TrialModel,
 )
 
 STEP = 1e-6
@@ -149,12 +149,12 @@ class Ramp(Method):
             provenance=provenance.make(settings, raw, None),
         )
 
-    def redrawing(self, raw: xr.Dataset, settings: RampSettings, errors: xr.Dataset) -> Redrawing:
+    def trial_model(self, raw: xr.Dataset, settings: RampSettings, errors: xr.Dataset) -> TrialModel:
         def draw(raw: xr.Dataset, settings: Any, generator: np.random.Generator) -> tuple[xr.Dataset, Any]:
             noise = 1e-7 * generator.normal(size=raw["distance"].shape)
             return raw.assign(distance=raw["distance"].copy(data=raw["distance"].values + noise)), settings
 
-        return Redrawing(raw.load(), settings, {"noise": Redraw(draw, own=True)})
+        return TrialModel(raw.load(), settings, {"noise": RandomSource(draw, own=True)})
 
     def plan(self, settings: RampSettings) -> xr.Dataset:
         raise MethodError("a ramp has no plan")

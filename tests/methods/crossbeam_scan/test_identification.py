@@ -17,7 +17,7 @@ from errormotion.methods.crossbeam_scan.identification.chain import SOURCES
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
 from errormotion.methods.crossbeam_scan.identification.registration import blocks, kernels
 from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
-from errormotion.montecarlo.trials import redrawing_of, sample
+from errormotion.montecarlo.trials import sample, trial_model_of
 from errormotion.twin import VirtualMachine
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
 
@@ -150,7 +150,7 @@ def test_a_guide_makes_pitch_certain(found):
 def test_trials_have_the_stated_uncertainty(strain, campaigns, found, remembering):
     settings, errors = CrossbeamScanSettings(strain=strain, **EXACT), found[strain][0]
     with remembering():
-        drawn = redrawing_of(CrossbeamScan(), campaigns[0], settings, errors)
+        drawn = trial_model_of(CrossbeamScan(), campaigns[0], settings, errors)
     trials, reasons = sample(CrossbeamScan(), drawn, np.random.SeedSequence(1), range(60), (9, 6), list(drawn.sources))
     assert not reasons
     # 60 trials: 1 +- 0.09

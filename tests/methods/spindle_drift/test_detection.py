@@ -106,7 +106,7 @@ def test_radius_and_scales_are_sources_that_all_beams_have_in_common(machine, me
     assert ids["radius of the sphere"]
     assert not ids["scale of the positions X"]
     # Each draw changes the beams as its source states.
-    trials = method.redrawing(uncertain, SETTINGS, beams)
+    trials = method.trial_model(uncertain, SETTINGS, beams)
     for name, groups in (("radius of the sphere", 1), ("scales of the positions", 3)):
         rng = np.random.default_rng(0)
         draws = [trials.sources[name].draw(trials.raw, trials.settings, rng) for _ in range(40)]

@@ -10,7 +10,7 @@ from errormotion.estimation.derivatives import along, by_rows
 from errormotion.instruments.spindle_frame.settings import FrameSettings
 from errormotion.methods.spindle_drift import SpindleDrift, SpindleDriftSettings, simulation
 from errormotion.methods.spindle_drift.model import observe
-from errormotion.montecarlo.trials import redrawing_of, trial
+from errormotion.montecarlo.trials import trial, trial_model_of
 from errormotion.twin import Event, VirtualMachine
 
 TIMES = 10.0 * np.arange(60)
@@ -121,8 +121,8 @@ def test_errors_within_a_reference_state_of_several_means_have_their_spread(warm
         reference_time=0.0, reference_average=100.0, noise="stated", functional_point=(0.0, 0.0, 0.0)
     )
     errors = method.identify(warming, settings)
-    redrawing = redrawing_of(method, warming, settings, errors)
-    draws = [trial(method, redrawing, np.random.SeedSequence(k)).em.twist().values[:11, :5] for k in range(150)]
+    trial_model = trial_model_of(method, warming, settings, errors)
+    draws = [trial(method, trial_model, np.random.SeedSequence(k)).em.twist().values[:11, :5] for k in range(150)]
     u = np.sqrt(np.diagonal(errors["covariance"].values, axis1=1, axis2=2))[:11, :5]
     # Of 150 draws 6 % is chance, and 4 times as much in 55 values.
     np.testing.assert_allclose(np.std(draws, axis=0, ddof=1) / u, 1.0, atol=0.24)

@@ -12,7 +12,7 @@ from errormotion.datasets import build_errors, provenance
 from errormotion.datasets.timing import start_of
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
-from errormotion.plugins import Redraw, Redrawing
+from errormotion.plugins import RandomSource, TrialModel
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -103,17 +103,17 @@ def _sensitivity(p: np.ndarray, nominal: RigidTransform) -> np.ndarray:
     return np.asarray((up - down) / 2e-6)
 
 
-def redrawing(raw: xr.Dataset, settings: CrossbeamScanSettings) -> Redrawing:
+def trial_model(raw: xr.Dataset, settings: CrossbeamScanSettings) -> TrialModel:
     """Return the scans of a pocket with their sources for the Monte Carlo method: lines, radius and centre.
 
     The scans state no noise. Their lines are drawn with replacement, which reproduces their scatter.
     """
     radius = float(raw["pocket_radius_uncertainty"]) if "pocket_radius_uncertainty" in raw else RADIUS_UNCERTAINTY
-    sources = {"lines": Redraw(_lines, own=True), "radius of the pocket": _shift("pocket_radius", radius)}
+    sources = {"lines": RandomSource(_lines, own=True), "radius of the pocket": _shift("pocket_radius", radius)}
     if "pocket_centre_uncertainty" in raw:
         centre = np.asarray(raw["pocket_centre_uncertainty"].values, dtype=float)
         sources["centre of the pocket"] = _shift("pocket_centre", centre)
-    return Redrawing(raw.load(), settings, sources)
+    return TrialModel(raw.load(), settings, sources)
 
 
 def _lines(
@@ -128,7 +128,7 @@ def _lines(
     return raw.assign({name: chosen[name].transpose(*raw[name].dims) for name in ("height", "stage")}), settings
 
 
-def _shift(name: str, uncertainty: Array | float) -> Redraw:
+def _shift(name: str, uncertainty: Array | float) -> RandomSource:
     def draw(
         raw: xr.Dataset, settings: CrossbeamScanSettings, generator: Generator
     ) -> tuple[xr.Dataset, CrossbeamScanSettings]:
@@ -136,4 +136,4 @@ def _shift(name: str, uncertainty: Array | float) -> Redraw:
         change = uncertainty * generator.normal(size=value.shape)
         return raw.assign({name: value.copy(data=value.values + change)}), settings
 
-    return Redraw(draw, own=True)
+    return RandomSource(draw, own=True)

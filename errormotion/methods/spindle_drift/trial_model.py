@@ -1,4 +1,4 @@
-"""Redrawing of the readings of a beam detection for the Monte Carlo method; that of a drift follows from its model."""
+"""Trial model of a beam detection for the Monte Carlo method; that of a drift follows from its model."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import xarray as xr
 from errormotion.methods.spindle_drift.identification.beams import RADIUS_OF_SPHERE, SCALES
 from errormotion.methods.spindle_drift.identification.detection import segmented
 from errormotion.methods.spindle_drift.settings import TrialSettings
-from errormotion.plugins import Redraw, Redrawing, replaced
+from errormotion.plugins import RandomSource, TrialModel, replaced
 
 if TYPE_CHECKING:
     from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 
-def redrawing_of_beams(raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> Redrawing:
+def trial_model_of_beams(raw: xr.Dataset, settings: SpindleDriftSettings, errors: xr.Dataset) -> TrialModel:
     """Return the readings of the stepped sphere, with the noise of each beam's residuals; radius; and scales."""
     steps = segmented(raw, settings, []) if "scan" in raw.variables else raw
     steps = steps.load().assign(distance=steps["distance"].transpose("channel", "profile", "step"))
@@ -43,9 +43,9 @@ def redrawing_of_beams(raw: xr.Dataset, settings: SpindleDriftSettings, errors: 
         drawn = centre.copy(data=middle + (centre.values - middle) * factor)
         return raw.assign(sphere_centre=drawn), settings
 
-    sources = {"readings": Redraw(draw, own=True)}
+    sources = {"readings": RandomSource(draw, own=True)}
     if float(steps.get("sphere_radius_uncertainty", 0.0)) > 0:
-        sources[RADIUS_OF_SPHERE] = Redraw(radius, groups=(RADIUS_OF_SPHERE,))
+        sources[RADIUS_OF_SPHERE] = RandomSource(radius, groups=(RADIUS_OF_SPHERE,))
     if float(steps.get("position_scale_uncertainty", 0.0)) > 0:
-        sources[SCALES] = Redraw(scales, groups=(SCALES,))
-    return Redrawing(steps, TrialSettings.of(settings), sources)
+        sources[SCALES] = RandomSource(scales, groups=(SCALES,))
+    return TrialModel(steps, TrialSettings.of(settings), sources)

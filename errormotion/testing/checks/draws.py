@@ -11,8 +11,8 @@ import numpy as np
 import xarray as xr
 from numpy.random import SeedSequence
 
-from errormotion.montecarlo.trials import redrawing_of, sample, trial
-from errormotion.plugins import MethodSubject, Redrawing, states
+from errormotion.montecarlo.trials import sample, trial, trial_model_of
+from errormotion.plugins import MethodSubject, TrialModel, states
 from errormotion.testing.checks.coverage import require_honest, tested_places
 from errormotion.testing.kit import require
 from errormotion.testing.results import covariance, influence, names, raw_data, values
@@ -23,9 +23,9 @@ SMALL = 1e-3
 """Fraction of a standard uncertainty below which draws and influence need not agree, as effects of second order."""
 
 
-def why_no_redrawing(subject: MethodSubject) -> str:
+def why_no_trial_model(subject: MethodSubject) -> str:
     """Return why the checks do not apply: the method has no draws of its sources."""
-    return "" if states(subject.plugin, "redrawing") else "the method has no draws of its sources (redrawing)"
+    return "" if states(subject.plugin, "trial_model") else "the method has no draws of its sources (trial_model)"
 
 
 def sources_drawn(subject: MethodSubject) -> str:
@@ -78,12 +78,12 @@ def sources_as_stated(subject: MethodSubject) -> str:
 
 
 @lru_cache(maxsize=4)
-def _drawn(subject: MethodSubject) -> tuple[xr.Dataset, xr.Dataset, Redrawing]:
+def _drawn(subject: MethodSubject) -> tuple[xr.Dataset, xr.Dataset, TrialModel]:
     """Return raw data, result, and the draws of the sources, for two checks."""
     raw = raw_data(subject)
     errors, _ = subject.outcome(0)
     with _quiet():
-        return raw, errors, redrawing_of(subject.plugin(), raw, subject.effective_settings(), errors)
+        return raw, errors, trial_model_of(subject.plugin(), raw, subject.effective_settings(), errors)
 
 
 def _groups(errors: xr.Dataset) -> set[str]:
@@ -94,7 +94,7 @@ def _groups(errors: xr.Dataset) -> set[str]:
     return {str(group) for group in errors["source_group"].values[moving]}
 
 
-def _parts(drawn: Redrawing) -> dict[str, list[str]]:
+def _parts(drawn: TrialModel) -> dict[str, list[str]]:
     """Return the sources without independent part by their names; sources with a common group together."""
     parts: list[tuple[list[str], set[str]]] = []
     for name, source in drawn.sources.items():

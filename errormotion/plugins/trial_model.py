@@ -17,7 +17,7 @@ Act = Callable[[xr.Dataset, np.random.Generator], xr.Dataset]
 
 
 @dataclass(frozen=True)
-class Redraw:
+class RandomSource:
     """One source of uncertainty, independent of all others.
 
     Attributes
@@ -41,7 +41,7 @@ class Redraw:
 
 
 @dataclass(frozen=True)
-class Redrawing:
+class TrialModel:
     """Raw data and all sources of their uncertainty.
 
     Attributes
@@ -52,7 +52,7 @@ class Redrawing:
     settings : PluginSettings
         Settings for the same result from ``raw`` as from the measured data: automatic choices of the method are
         stated, tests for outliers are off, and results without effect on the values are omitted.
-    sources : mapping of str to Redraw
+    sources : mapping of str to RandomSource
         By name, in their order of application.
     identify : function, optional
         ``identify(raw, settings)`` returns the error dataset of a trial, in place of that of the method: for a method
@@ -61,7 +61,7 @@ class Redrawing:
 
     raw: xr.Dataset
     settings: Any
-    sources: Mapping[str, Redraw]
+    sources: Mapping[str, RandomSource]
     identify: Callable[[xr.Dataset, Any], xr.Dataset] | None = None
 
 
