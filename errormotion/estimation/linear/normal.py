@@ -60,6 +60,7 @@ class Normal:
     _pivots: Array  # (B, s p, s p): inverse pivots P_k^-1 of the blocks of s rows
     _back: Array  # (B - 1, s p, s p): P_k^-1 times the coupling C_k with the next block
     _G: Array
+    _gauge: Array  # (q, g)
 
     @cached_property
     def _inverses(self) -> Array:
@@ -102,10 +103,15 @@ class Normal:
 
     @property
     def log_determinant(self) -> float:
-        """Logarithm of the determinant of the normal matrix; with a gauge, of its part that is not 0."""
+        """Logarithm of the determinant of the normal matrix; with a gauge N, of its part that is not 0.
+
+        With any columns W beside the gauge, ``det(W' S W) / det([W N])^2`` is the same. Those of the root R, with
+        ``R' S R = 1``, give ``1 / det([R N])^2``. Rows are scaled, since units and sizes of unknowns differ.
+        """
         local = -float(np.linalg.slogdet(self._pivots)[1].sum()) if self._pivots.size else 0.0
-        lost = len(self.S) - self.root.shape[1]
-        return local + float(np.log(np.linalg.eigvalsh(self.S)[lost:]).sum())
+        whole = np.hstack([self.root, self._gauge])
+        size = np.abs(whole).max(axis=1, keepdims=True, initial=0.0)
+        return local - 2 * float(np.linalg.slogdet(whole / size)[1] + np.log(size).sum())
 
     @property
     def shared(self) -> Array:
@@ -178,7 +184,8 @@ def factorised(band: Sequence[Array], G: Array, D: Array, gauge: Array | None = 
     F = _swept(pivots, back, G)
     S = D - np.tensordot(G, F, axes=((0, 1), (0, 1)))
     S = (S + S.T) / 2
-    return Normal(F, S, _root(S, D, gauge), pivots, back, G)
+    gauge = np.zeros((len(D), 0)) if gauge is None else gauge
+    return Normal(F, S, _root(S, D, gauge), pivots, back, G, gauge)
 
 
 def _superblocks(band: Sequence[Array], R: int, p: int, s: int, blocks: int) -> tuple[Array, Array]:
@@ -317,7 +324,7 @@ def _plain_root(S: Array) -> Array | None:
     return np.asarray(inverse.T) if certain else None
 
 
-def _root(S: Array, D: Array, gauge: Array | None) -> Array:
+def _root(S: Array, D: Array, gauge: Array) -> Array:
     """Return a square root of the covariance of the border, without the gauge."""
     q = len(S)
     if not q:
@@ -325,10 +332,10 @@ def _root(S: Array, D: Array, gauge: Array | None) -> Array:
     diagonal = np.diagonal(D)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = S * scale[:, None] * scale
-    if (gauge is None or not gauge.size) and (root := _plain_root(scaled)) is not None:
+    if not gauge.size and (root := _plain_root(scaled)) is not None:
         return scale[:, None] * root
     Z = np.eye(q)
-    if gauge is not None and gauge.size:
+    if gauge.size:
         # Changes along the gauge, in scaled unknowns; the solution is in their orthogonal complement.
         full, _ = np.linalg.qr(gauge / scale[:, None], mode="complete")
         Z = full[:, gauge.shape[1] :]

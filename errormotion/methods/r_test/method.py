@@ -52,7 +52,7 @@ class RTest(ModelMethod):
         id="r_test",
         summary="Location errors and error motions of a rotary table by spheres and a nest of sensors (R-test)",
         status="simulated_only",
-        version="2",
+        version="3",
         cannot_see=(
             "the mean of the axial displacement and of the rotation about the axis, and once-per-revolution terms that "
             "a displaced or tilted plate of spheres imitates",
@@ -91,6 +91,7 @@ class RTest(ModelMethod):
         problem = _problem(raw, layout)
         _check_sense(raw, problem)
         known = np.where(layout.determined, 0.0, np.nan)
+        angle, sphere, sensor = (index.ravel() for index in np.indices(layout.reading.shape))
         lines = {name: k for name, k in layout.locations.items() if layout.seen[k]}
         # The line of the axis displaced by +1 displaces the table by +1: an error motion of -1 (tool relative to it).
         shift = [np.tile(-np.eye(6)[k], (len(layout.angle), 1)) for k in lines.values()]
@@ -99,6 +100,8 @@ class RTest(ModelMethod):
             places=Places(lambda x, _: x.motion + known, len(layout.angle)),
             datum=Datum(np.stack([*shift, *layout.gauge[1]], axis=2), ~np.isnan(known), LINE, tuple(lines)),
             recorded=("displacement", ("angle", "sphere", "sensor")),
+            order=angle.astype(float),
+            series=sphere * layout.reading.shape[2] + sensor,
             suspects=_suspects(layout, problem),
             name=layout.name_of,
             refuses_contradictions=True,

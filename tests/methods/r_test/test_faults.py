@@ -101,3 +101,21 @@ def test_an_index_that_is_shifted_at_all_angles_is_not_found() -> None:
     assert any("shifted by the same amount" in text for text in METHOD.info.cannot_see)
     line, true = errors["location_error"].values[2:], truth["location_error"].values[2:]
     assert np.linalg.norm(line - true) == pytest.approx(np.radians(2) * np.linalg.norm(true), rel=0.6)
+
+
+def test_correlated_noise_of_neighbouring_angles_is_noted_or_refused() -> None:
+    seen = 0
+    for seed in range(4):
+        raw = simulated(seed)[0].drop_vars("displacement_noise").transpose("angle", ...)
+        e = np.random.default_rng(seed).standard_normal(raw["displacement"].shape)
+        white = METHOD.identify(raw.assign(displacement=raw["displacement"] + 0.3e-6 * e))
+        assert not any("correlated" in note for note in white.em.notes)
+        for k in range(1, len(e)):
+            e[k] = 0.8 * e[k - 1] + 0.6 * e[k]
+        try:
+            found = METHOD.identify(raw.assign(displacement=raw["displacement"] + 0.3e-6 * e))
+        except MethodError as error:  # a slow wave may look like a sphere that moves
+            seen += "has moved on the table" in str(error)
+        else:
+            seen += any("neighbouring displacements is correlated" in note for note in found.em.notes)
+    assert seen == 4
