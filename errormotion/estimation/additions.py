@@ -60,9 +60,9 @@ def with_linear(
     given = problem.derivatives
 
     def equation(y: Array, x: Any, c: Any) -> Array:
-        found = problem.equation(y, base(*x[:-1]), c)
+        residual = problem.equation(y, base(*x[:-1]), c)
         added = np.einsum("nmk,nk->nm", J, x[-1])
-        return np.asarray(found - (added[:, 0] if found.ndim == 1 else added))
+        return np.asarray(residual - (added[:, 0] if residual.ndim == 1 else added))
 
     def derivatives(y: Array, x: Any, c: Any) -> Mapping[str, Array]:
         others = {} if given is None else given(y, base(*x[:-1]), c)

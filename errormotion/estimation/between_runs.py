@@ -129,15 +129,15 @@ def fit_runs(X: Array, y: Array, V0: Array, time: Array | None = None) -> RunFit
 
 def alike(time: Array | None, n: int) -> list[tuple[float, float]]:
     """Return the times T over which n runs may be alike, with their log priors; T = 0 alone for few runs."""
-    found = [(0.0, 0.0)]
+    candidates = [(0.0, 0.0)]
     extent = 0.0 if time is None else float(np.ptp(time))
     if n < FEWEST or not extent > 0:
-        return found
+        return candidates
     interval = extent / (n - 1)
     for multiple in _MULTIPLES:
         if multiple * interval <= extent:
-            found.append((multiple * interval, -0.5 * float(np.arctanh(np.exp(-1 / multiple)) / TYPICAL) ** 2))
-    return found
+            candidates.append((multiple * interval, -0.5 * float(np.arctanh(np.exp(-1 / multiple)) / TYPICAL) ** 2))
+    return candidates
 
 
 def correlation(time: Array | None, n: int, T: float) -> Array:
@@ -169,8 +169,8 @@ def by_moving_ranges(residual: Array, V0: Array, used: Array | None = None) -> f
 def difference_variance(V: Array) -> Array:
     """Return the variance of the differences of neighbours, (n - 1,); equal effects of a shared source cancel."""
     diagonal = np.diag(V)
-    found: Array = np.maximum(diagonal[1:] + diagonal[:-1] - 2 * np.diag(V, 1), 0.0)
-    return found
+    variance: Array = np.maximum(diagonal[1:] + diagonal[:-1] - 2 * np.diag(V, 1), 0.0)
+    return variance
 
 
 def variance_between(value: Array, variance: Array) -> tuple[Array, Array, Array]:

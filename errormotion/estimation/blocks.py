@@ -77,10 +77,10 @@ class Table:
             return np.asarray(table[self.index])
         if self.weight is None:
             return np.asarray(table[self.index])
-        found = self.weight[:, :1] * table[self.index[:, 0]]
+        rows = self.weight[:, :1] * table[self.index[:, 0]]
         for slot in range(1, self.slots):
-            found += self.weight[:, slot, None] * table[self.index[:, slot]]
-        return np.asarray(found)
+            rows += self.weight[:, slot, None] * table[self.index[:, slot]]
+        return np.asarray(rows)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -152,7 +152,7 @@ def components(
     names = tuple(dict.fromkeys(name for block in problem.unknowns for name in block.component if name))
     linear = linearised(problem, problem.start)
     theta: Array | None = None
-    found: Fit | None = None
+    weighted_fit: Fit | None = None
     change = np.inf
     for _ in range(MAX_FITS):
         contrasts = _Contrasts.of(linear, names, estimated, what)
@@ -165,24 +165,24 @@ def components(
             before, change = change, float((np.abs(used - np.maximum(last, floor)) / size).max(initial=0.0))
             if change <= CHANGED or (change <= STALLED and change > before / 2):
                 break
-        start = linear.at if found is not None else None
+        start = linear.at if weighted_fit is not None else None
         weighted = _weighted(problem, contrasts.names, used)
-        found = fit(weighted, refresh=refresh, what=what, start=start, numbering=linear.numbering)
+        weighted_fit = fit(weighted, refresh=refresh, what=what, start=start, numbering=linear.numbering)
         if problem.linear and refresh is None:
             break  # the contrasts are the same at any solution
-        linear = _unweighted(found.linear, problem, contrasts.names, used)
+        linear = _unweighted(weighted_fit.linear, problem, contrasts.names, used)
     else:
         raise FitError(
             f"the variances of {', '.join(names) or NOISE} have not converged in {MAX_FITS} fits to {what}",
             code="estimation.variances.not_converged",
         )
-    if found is None:
+    if weighted_fit is None:
         raise FitError("no fit", code="estimation.no_fit")
     unit = np.where(used > 0, used, 1.0)
     inverse = np.linalg.pinv(information * unit * unit[:, None], hermitian=True)
     covariance = np.asarray(inverse * unit * unit[:, None], dtype=float)
     at = tuple(contrasts.at[name] for name in contrasts.names)
-    return Components(found, contrasts.names, theta, covariance, likelihood, floor, at)
+    return Components(weighted_fit, contrasts.names, theta, covariance, likelihood, floor, at)
 
 
 def noise_variance(fit: Fit) -> tuple[float, float]:
@@ -263,13 +263,13 @@ class _Contrasts:
         unknown = int(fixed.size) - (0 if gauge is None else gauge.shape[1])
         if number.local is not None:
             unknown += int(problem.unknowns[number.local].freed.sum())
-        found = (*names, NOISE) if noise else tuple(names)
+        groups = (*names, NOISE) if noise else tuple(names)
         at = {name: np.flatnonzero(by_column == i) for i, name in enumerate(names)}
         which = [np.flatnonzero(by_column[random] == i) for i in range(len(names))]
         if noise:
             at[NOISE], which = np.zeros(0, dtype=np.intp), [*which, np.zeros(0, dtype=np.intp)]
         c = max(float(np.vdot(r, r) - whole[-1, -1]), 0.0)
-        return cls(found, at, which, known[random], (A + A.T) / 2, b, c, int(linear.used.sum()) - unknown)
+        return cls(groups, at, which, known[random], (A + A.T) / 2, b, c, int(linear.used.sum()) - unknown)
 
     def floor(self) -> Array:
         """Return the smallest variances of the final fit, (k,)."""

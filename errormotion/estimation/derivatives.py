@@ -54,7 +54,7 @@ def by_rows(
         Of the tables ``which``; w = 1 for one row a reading.
     """
     rows = [table.rows(value) for table, value in zip(tables, values, strict=True)]
-    found = []
+    derivatives = []
     for k in which:
         table, seen = tables[k], rows[k]
         width = values[k].shape[1]
@@ -63,7 +63,7 @@ def by_rows(
         slots = 1 if summed else seen.shape[1]
         parts: list[Array] = []
         if not width:
-            found.append(np.zeros((*column(equation(rows)).shape, slots, 0)))
+            derivatives.append(np.zeros((*column(equation(rows)).shape, slots, 0)))
             continue
         for slot in range(slots):
             for col in range(width):
@@ -73,8 +73,8 @@ def by_rows(
         J = J.reshape(*J.shape[:2], slots, width)
         if weighed and summed and table.weight is not None:
             J = J * table.weight[:, None, :, None]
-        found.append(J)
-    return found
+        derivatives.append(J)
+    return derivatives
 
 
 def along(equation: Callable[[Array], Array], y: Array, scale: Array) -> Array:

@@ -250,6 +250,6 @@ def _half_of_inverse(N: Array, prior: Array, rounding: float) -> tuple[Array, fl
     # in the order of LAPACK, and in place: copies would take half of the time
     factor = linalg.cholesky(scaled.T, lower=True, overwrite_a=True, check_finite=False)
     log_det = 2 * float(np.log(np.diag(factor) / scale).sum())
-    found: Array = linalg.lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
-    found *= scale
-    return found, log_det
+    inverse: Array = linalg.lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+    inverse *= scale
+    return inverse, log_det

@@ -28,17 +28,17 @@ _LARGE = 2e8
 """Operations beyond which sources are not joined."""
 
 
-def fewest(found: Relative) -> Relative:
+def fewest(relative: Relative) -> Relative:
     """Return the same errors with the fewest sources; each covariance is the same but for rounding."""
-    sources, of_h = found.errors.sources, found.influence
+    sources, of_h = relative.errors.sources, relative.influence
     if not sources:
-        return found
-    own = np.diagonal(found.errors.own, axis1=1, axis2=2)
+        return relative
+    own = np.diagonal(relative.errors.own, axis1=1, axis2=2)
     variance = own.copy()
     for source in sources:
         variance += np.square(source.effect)
     u = np.sqrt(np.where(variance == 0, np.inf, variance))  # NaN where unknown
-    u_h = np.sqrt(np.diagonal(found.covariance))
+    u_h = np.sqrt(np.diagonal(relative.covariance))
     u_h = np.where(u_h > 0, u_h, np.inf)
     least, rounding = NEGLIGIBLE * u, ROUNDING * u
     kept, influence = list[Source](), list[Array]()
@@ -53,8 +53,8 @@ def fewest(found: Relative) -> Relative:
                 small = size <= rounding  # False for NaN
                 kept.append(replace(source, effect=np.where(small, 0.0, source.effect)) if small.any() else source)
                 influence.append(effect)
-    errors = replace(found.errors, sources=kept)
-    return replace(found, errors=errors, influence=np.reshape(influence, (len(kept), of_h.shape[1])))
+    errors = replace(relative.errors, sources=kept)
+    return replace(relative, errors=errors, influence=np.reshape(influence, (len(kept), of_h.shape[1])))
 
 
 def _joined(sources: list[Source], of_h: Array, u: Array, u_h: Array) -> tuple[list[Source], Array] | None:

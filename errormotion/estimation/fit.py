@@ -115,16 +115,16 @@ class Fit:
         """Hat matrix ``J C J'`` of the whitened numbers of each reading, (n, m, m)."""
         linear, normal = self.linear, self.normal
         n, m = linear.used.shape
-        found = np.zeros((n, m, m))
+        hat = np.zeros((n, m, m))
         # J C J' = J_L own J_L' + E E' with E = (J_B - J_L F) root
         shared = normal.shared
         for first in range(0, n, _ROWS):
             rows = np.arange(first, min(first + _ROWS, n))
             E = linear.effect(shared, normal.root, rows)
-            found[rows] = E @ np.swapaxes(E, 1, 2)
+            hat[rows] = E @ np.swapaxes(E, 1, 2)
         if linear.numbering.local is not None:
-            found += self._local_hat()
-        return found
+            hat += self._local_hat()
+        return hat
 
     def _local_hat(self) -> Array:
         linear, groups = self.linear, self.linear.numbering.of_local

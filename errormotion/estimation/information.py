@@ -216,14 +216,14 @@ class Reduced:
             z = cho_solve((self.factor, True), r.T).T
             last, rz = rz, (r * z).sum(axis=1)
             p = z + np.where(active, rz / np.where(active, last, 1.0), 0.0)[:, None] * p
-        found: Array = (residual * weighted).sum(axis=1) + (w * t).sum(axis=1)
-        return found
+        decreases: Array = (residual * weighted).sum(axis=1) + (w * t).sum(axis=1)
+        return decreases
 
     def _values(self, x: Array) -> Array:
         """Return the expected values of each dataset for parameters (m, n d + g)."""
         size = self.y.shape[1]
-        found: Array = x[:, :size] + np.matmul(self.S, x[:, size:, None])[..., 0]
-        return found
+        values: Array = x[:, :size] + np.matmul(self.S, x[:, size:, None])[..., 0]
+        return values
 
     def _gradient(self, weighted: Array) -> Array:
         return np.concatenate([weighted, np.matmul(np.swapaxes(self.S, 1, 2), weighted[..., None])[..., 0]], axis=1)
@@ -239,8 +239,8 @@ def _applied(W: Array, U: Array, v: Array) -> Array:
     m, n, d = W.shape[:3]
     blocks = np.matmul(W, v.reshape(m, n, d, 1)).reshape(m, n * d)
     inner = np.matmul(v[:, None, :], U)  # (m, 1, p)
-    found: Array = blocks - np.matmul(U, np.swapaxes(inner, 1, 2))[..., 0]
-    return found
+    product: Array = blocks - np.matmul(U, np.swapaxes(inner, 1, 2))[..., 0]
+    return product
 
 
 def _inverse(matrices: Array, kept: NDArray[np.bool_]) -> Array:
@@ -249,5 +249,5 @@ def _inverse(matrices: Array, kept: NDArray[np.bool_]) -> Array:
     scale = np.sqrt(np.where(kept, np.diagonal(matrices, axis1=1, axis2=2), 1.0))
     outer = scale[:, :, None] * scale[:, None, :]
     whole = np.where(both, matrices / outer, np.eye(matrices.shape[1]))
-    found: Array = np.where(both, np.linalg.inv(whole) / outer, 0.0)
-    return found
+    inverse: Array = np.where(both, np.linalg.inv(whole) / outer, 0.0)
+    return inverse

@@ -65,8 +65,8 @@ class Whitener:
     def normal(self, effects: Array, a: Array) -> tuple[Array, Array]:
         """Return the normal matrix (p, p) of effects (p, n, d), and their products (p,) with one array (n, d)."""
         both = np.concatenate([effects, a[None]])
-        found = self.product(both, both)
-        return found[:-1, :-1], found[:-1, -1]
+        normal = self.product(both, both)
+        return normal[:-1, :-1], normal[:-1, -1]
 
     def square(self, a: Array) -> float:
         """Return ``a' V^-1 a`` of one array (n, d): a chi-square with `degrees` degrees of freedom."""
@@ -177,12 +177,12 @@ def _roots(D: Array) -> tuple[Array, NDArray[np.intp], Array, float]:
 
 def inverse_of_lower(L: Array) -> Array:
     """Return the inverses of lower triangular matrices (n, d, d), row by row: a third of the time of a general one."""
-    found = np.zeros_like(L)
+    inverse = np.zeros_like(L)
     reciprocal = 1 / np.diagonal(L, axis1=1, axis2=2)
     for i in range(L.shape[1]):
-        found[:, i, i] = reciprocal[:, i]
-        found[:, i, :i] = -reciprocal[:, i, None] * np.matmul(L[:, i, None, :i], found[:, :i, :i])[:, 0]
-    return found
+        inverse[:, i, i] = reciprocal[:, i]
+        inverse[:, i, :i] = -reciprocal[:, i, None] * np.matmul(L[:, i, None, :i], inverse[:, :i, :i])[:, 0]
+    return inverse
 
 
 def root_of(covariance: Array, *, unit: Array | None = None, smallest: float = MIN_VARIANCE) -> Array:

@@ -112,13 +112,13 @@ class Problem:
 
     def known(self, rows: list[Array]) -> Array:
         """Return the residuals for rows, (n, m); NaN where a reading is missing."""
-        found = column(self.evaluate(self.y, rows))
+        residual = column(self.evaluate(self.y, rows))
         missing = ~np.isfinite(column(self.readings))
         if not missing.any():
-            return found
-        if found.shape[1] == missing.shape[1]:
-            return np.where(missing, np.nan, found)
-        return np.where(missing.any(axis=1, keepdims=True), np.nan, found)
+            return residual
+        if residual.shape[1] == missing.shape[1]:
+            return np.where(missing, np.nan, residual)
+        return np.where(missing.any(axis=1, keepdims=True), np.nan, residual)
 
     def without(self, wrong: NDArray[np.bool_]) -> Problem:
         """Return the problem without the readings ``wrong``, in the shape of the readings or (n,)."""

@@ -109,10 +109,10 @@ def effects_of_constants(
         return []
     each = list(effects.values())
     if fit.linear.numbering.in_order and not fit.normal.chained:
-        found = _by_parts(fit, each, seen)
+        by_constant = _by_parts(fit, each, seen)
     else:
-        found = [_at_once(fit, one, seen) for one in each]
-    return list(zip(effects, found, strict=True))
+        by_constant = [_at_once(fit, one, seen) for one in each]
+    return list(zip(effects, by_constant, strict=True))
 
 
 def _effect(fit: Fit, tables: Mapping[int, Table], J: Mapping[int, Array], k: int) -> _Effect:
@@ -147,13 +147,13 @@ def _by_parts(fit: Fit, effects: Sequence[_Effect], seen: Seen) -> list[Array]:
             if one.of_readings is not None:
                 sums -= np.tensordot(of_border, one.change(part), axes=((0, 2), (0, 1)))
     z = [normal.covariance @ sums for sums in b]
-    found = [np.empty((one.constant.sources, places, d)) for one in effects]
+    effects_by_source = [np.empty((one.constant.sources, places, d)) for one in effects]
     for first in range(0, places, _ROWS):
         part = slice(first, first + _ROWS)
         rows, E = seen.index[part], seen.border[part]
         H = -seen.local[part] @ P[rows] @ np.swapaxes(A[rows], 1, 2) @ W[rows]
         border, local = E.any(), H.any()
-        for its, one, of_border in zip(found, effects, z, strict=True):
+        for its, one, of_border in zip(effects_by_source, effects, z, strict=True):
             effect = np.zeros((len(rows), d, len(its)))
             if one.of_readings is not None:
                 if local:
@@ -165,7 +165,7 @@ def _by_parts(fit: Fit, effects: Sequence[_Effect], seen: Seen) -> list[Array]:
             if one.of_errors is not None:
                 effect += one.direct(part)
             its[:, part] = np.moveaxis(effect, 2, 0)
-    return found
+    return effects_by_source
 
 
 def _on_border(fit: Fit, part: slice) -> Array:
@@ -175,20 +175,20 @@ def _on_border(fit: Fit, part: slice) -> Array:
     B = np.zeros((len(columns), q + 1, linear.border.shape[1]))
     seen = np.swapaxes(linear.border[part], 1, 2)
     np.add.at(B, (np.arange(len(columns))[:, None], columns), seen)
-    found = B[:, :q]
+    border = B[:, :q]
     if fit.normal.coupled:
-        found = found - np.swapaxes(linear.local_matrix[part] @ fit.normal.F[part], 1, 2)
-    return found
+        border = border - np.swapaxes(linear.local_matrix[part] @ fit.normal.F[part], 1, 2)
+    return border
 
 
 def _at_once(fit: Fit, effect: _Effect, seen: Seen) -> Array:
     """Return the effects of a constant, some sources at a time."""
     linear, normal = fit.linear, fit.normal
     places, d = seen.local.shape[:2]
-    found = np.empty((effect.constant.sources, places, d))
-    for first in range(0, len(found), _CHUNK):
+    by_source = np.empty((effect.constant.sources, places, d))
+    for first in range(0, len(by_source), _CHUNK):
         part = slice(first, first + _CHUNK)
-        its = np.zeros((places, d, len(found[part])))
+        its = np.zeros((places, d, len(by_source[part])))
         if effect.of_readings is not None:
             a, b = linear.gradient(linear.whitener @ effect.change(slice(None), part))
             y, z = normal.eliminated(-a, -b)
@@ -197,5 +197,5 @@ def _at_once(fit: Fit, effect: _Effect, seen: Seen) -> Array:
                 its += seen.local @ y[seen.index]
         if effect.of_errors is not None:
             its += effect.direct(slice(None), part)
-        found[part] = np.moveaxis(its, 2, 0)
-    return found
+        by_source[part] = np.moveaxis(its, 2, 0)
+    return by_source

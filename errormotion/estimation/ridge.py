@@ -32,8 +32,8 @@ def solve(X: Array, y: Array, weight: Array, strengths: Array) -> Array:
     root = np.sqrt(weight[use])
     left, size, right = np.linalg.svd(X[use] * root[:, None], full_matrices=False)
     ridge = strengths[:, None] * float(weight[use].sum())
-    found: Array = size * (left.T @ (y[use] * root)) / (size**2 + ridge) @ right
-    return found
+    solution: Array = size * (left.T @ (y[use] * root)) / (size**2 + ridge) @ right
+    return solution
 
 
 def left_out_residuals(X: Array, y: Array, weight: Array, group: NDArray[np.int64]) -> Array:

@@ -128,10 +128,10 @@ class Errors:
 
     def budget(self) -> dict[str, Array]:
         """Return the standard uncertainty by each group, (place, d); that of the independent part has the name ''."""
-        found = {"": np.sqrt(np.maximum(np.diagonal(self.own, axis1=1, axis2=2), 0.0))}
+        by_group = {"": np.sqrt(np.maximum(np.diagonal(self.own, axis1=1, axis2=2), 0.0))}
         for source in self.sources:
-            found[source.group] = np.hypot(found.get(source.group, 0.0), source.effect)
-        return found
+            by_group[source.group] = np.hypot(by_group.get(source.group, 0.0), source.effect)
+        return by_group
 
 
 def errors_of(
@@ -182,13 +182,13 @@ def errors_of(
     J = dict(zip(seen, its, strict=True))
     its_own, places_see = _by_place(fit, tables, J)
     own, E = its_own * factor, places_see.border
-    found = list[Source]()
+    sources_of_errors = list[Source]()
     if E.shape[2]:
         root = normal.root
         information = _prior(fit)
         words, at = _priors(fit)
         of_priors = _by_source(E @ (root @ root[at].T * np.sqrt(information[at])))
-        found += [
+        sources_of_errors += [
             Source(name, group, effect, identity, joined)
             for (name, group, identity, joined), effect in zip(words, of_priors, strict=True)
         ]
@@ -196,7 +196,7 @@ def errors_of(
         if places.count == 1:
             own = own + K @ np.swapaxes(K, 1, 2)
         else:
-            found += [
+            sources_of_errors += [
                 Source(f"{shared} {k + 1}", shared, each, joined=shared)
                 for k, each in enumerate(_by_source(K))
                 if each.any()
@@ -204,13 +204,13 @@ def errors_of(
     for k, effects in effects_of_constants(fit, tables, J, places_see):
         constant = problem.constants[k]
         names, identities = _named(constant, problem.constants._fields[k])
-        found += [
+        sources_of_errors += [
             Source(name, constant.group, effect, identity)
             for name, effect, identity in zip(names, effects, identities, strict=True)
         ]
     unknown = np.isnan(value)
     own = np.where(unknown[:, :, None] | unknown[:, None, :], np.nan, own)
-    return Errors(value, own, found)
+    return Errors(value, own, sources_of_errors)
 
 
 def _of_readings(root: Array, information: Array) -> Array:
@@ -297,7 +297,7 @@ def _named(constant: Constant, name: str) -> tuple[Sequence[str], Sequence[str]]
 def _by_source(effect: Array) -> Array:
     """Return effects (place, d, k) in the order of memory (k, place, d)."""
     places, d, k = effect.shape
-    found = np.empty((k, places, d))
+    effects = np.empty((k, places, d))
     for first in range(0, places, _ROWS):
-        found[:, first : first + _ROWS] = np.moveaxis(effect[first : first + _ROWS], 2, 0)
-    return found
+        effects[:, first : first + _ROWS] = np.moveaxis(effect[first : first + _ROWS], 2, 0)
+    return effects

@@ -204,12 +204,12 @@ def _estimated(
             f"the noise of {what} is not stated, and there is no redundancy to estimate it. State it, or measure more",
             code="estimation.noise.unknown",
         )
-    factor, found = (chi2 / freedom, float(freedom)) if estimate is None else estimate()
+    factor, estimated_freedom = (chi2 / freedom, float(freedom)) if estimate is None else estimate()
     ratio = float(np.sqrt(factor))
     if estimate is not None:
-        many = f"{found:.3g} degrees of freedom"
+        many = f"{estimated_freedom:.3g} degrees of freedom"
     shown = f": {size(ratio)} from the residuals, with {many}." if size else f", and estimated with {many}."
-    return Scatter(factor, found, ratio, Verdict.ESTIMATED, f"The noise of {what} is not stated{shown}")
+    return Scatter(factor, estimated_freedom, ratio, Verdict.ESTIMATED, f"The noise of {what} is not stated{shown}")
 
 
 def _probabilities(chi2: float, freedom: int, stated_freedom: float) -> tuple[float, float]:

@@ -63,8 +63,8 @@ def trial_model(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) 
     def trial(data: xr.Dataset, _settings: Any) -> xr.Dataset:
         drawn = {name: np.asarray(data[name].values) for name in numbers if name in data}
         changed = moved(weighed, data[READINGS].values.reshape(problem.readings.shape), drawn)
-        found = solve(replace(frozen, problem=changed), sources=False, start=solved.fit.linear.at)
-        return replaced(result, values_of(found))
+        solved_trial = solve(replace(frozen, problem=changed), sources=False, start=solved.fit.linear.at)
+        return replaced(result, values_of(solved_trial))
 
     return TrialModel(start, settings, sources, identify=trial)
 
@@ -124,15 +124,15 @@ def _recorded(observed: Observed, raw: xr.Dataset, y: Array, generator: np.rando
 
 def independent_draws(problem: Problem) -> dict[str, int]:
     """Return the number of independent draws of each source by its group: constants, and priors of unknowns."""
-    found: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for name, block in zip(problem.unknowns._fields, problem.unknowns, strict=True):
         count = int(np.count_nonzero(block.information[block.freed]))
         if count:
-            found[block.group or name] = found.get(block.group or name, 0) + count
+            counts[block.group or name] = counts.get(block.group or name, 0) + count
     for name, constant in zip(getattr(problem.constants, "_fields", ()), problem.constants, strict=True):
         if constant.sources:
-            found[constant.group or name] = found.get(constant.group or name, 0) + constant.sources
-    return found
+            counts[constant.group or name] = counts.get(constant.group or name, 0) + constant.sources
+    return counts
 
 
 def standard_draw(name: str, number: int) -> Callable[..., tuple[xr.Dataset, Any]]:

@@ -67,11 +67,11 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
     try:
         given = observed.problem
         observed = replace(observed, resolution=steps_of(observed))
-        observed, found, search = _cleaned(observed if sources else replace(observed, examined=None), start)
-        whole = beyond_of(observed, found)
+        observed, solution, search = _cleaned(observed if sources else replace(observed, examined=None), start)
+        whole = beyond_of(observed, solution)
         if whole is not observed:
-            observed, found = whole, fitted(whole, whole.problem, found)
-        neighbours = neighbours_of(observed, found)
+            observed, solution = whole, fitted(whole, whole.problem, solution)
+        neighbours = neighbours_of(observed, solution)
         observed = replace(
             observed,
             correlation=neighbours.phi,
@@ -79,14 +79,14 @@ def solve(observed: Observed, *, sources: bool = True, start: Unknown | None = N
             doubts=[*observed.doubts, neighbours.doubt],
         )
         if neighbours.phi > 0:
-            found = fitted(observed, observed.problem, found)
-        scatter, final = scatter_of(observed, found)
+            solution = fitted(observed, observed.problem, solution)
+        scatter, final = scatter_of(observed, solution)
         # An estimated variance has a Student distribution (GUM, G.3.2).
-        factor = (scatter.factor if final is found else 1.0) * float(
+        factor = (scatter.factor if final is solution else 1.0) * float(
             expansion(neighbours.freedom(scatter.freedom))
         ) ** 2
-        base = observed.problem if final is found else scaled(observed.problem, scatter.factor)
-        rounding = rounding_of(observed, base, scatter.factor if final is found else 1.0)
+        base = observed.problem if final is solution else scaled(observed.problem, scatter.factor)
+        rounding = rounding_of(observed, base, scatter.factor if final is solution else 1.0)
         if rounding is not None:
             observed = replace(
                 observed, notes=[*observed.notes, resolution.sentence(observed.what, rounding, observed.unit)]
@@ -133,7 +133,7 @@ def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, 
         )[0].problem
     searched = searchable(observed, problem)
     try:
-        found = cleaned(
+        search = cleaned(
             searched,
             suspects=observed.suspects,
             whole=observed.whole,
@@ -147,12 +147,12 @@ def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, 
         first = fit(searched, refresh=observed.refresh, what=what)
         suspects = () if observed.suspects is None else observed.suspects(first)
         raise _contradiction(what, [_likeliest(first, suspects)]) from error
-    words = [" or ".join([each.words, *each.rivals]) for each in found.undecided]
+    words = [" or ".join([each.words, *each.rivals]) for each in search.undecided]
     if words and observed.refuses_contradictions:
         raise _contradiction(what, words)
     name = what.removeprefix("the ")
-    notes, doubts = exclusions.notes(found, name), exclusions.doubts(found, name)
-    last = found.fit
+    notes, doubts = exclusions.notes(search, name), exclusions.doubts(search, name)
+    last = search.fit
     if searched is not problem:
         last = fitted(observed, replace(last.problem, noise=problem.noise), last)
     after = replace(
@@ -162,13 +162,13 @@ def _cleaned(observed: Observed, start: Unknown | None) -> tuple[Observed, Fit, 
         notes=[*observed.notes, *notes],
         doubts=[*observed.doubts, *doubts],
     )
-    return after, last, found
+    return after, last, search
 
 
 def _examined(observed: Observed, problem: Problem) -> list[str]:
     """Return a sentence on the outliers of readings that are all used."""
     try:
-        found = cleaned(
+        search = cleaned(
             searchable(observed, problem),
             suspects=observed.suspects,
             whole=observed.whole,
@@ -177,7 +177,7 @@ def _examined(observed: Observed, problem: Problem) -> list[str]:
         )
     except FitError:
         return [f"{observed.what[:1].upper()}{observed.what[1:]} contradict one another; all of them are used."]
-    return exclusions.kept(found, observed.what.removeprefix("the "))
+    return exclusions.kept(search, observed.what.removeprefix("the "))
 
 
 def _contradiction(what: str, words: list[str]) -> MethodError:
@@ -189,12 +189,12 @@ def _contradiction(what: str, words: list[str]) -> MethodError:
     )
 
 
-def _likeliest(found: Fit, suspects: Iterable[Candidate]) -> str:
+def _likeliest(solution: Fit, suspects: Iterable[Candidate]) -> str:
     """Return the words of the candidate that decreases the sum of squares most."""
     best, words = 0.0, ""
     for each in suspects:
         design = each.design if each.design.ndim == 3 else each.design[:, None, :]
-        u, N = information(found, design)
+        u, N = information(solution, design)
         gain = float(np.ravel(solved(u[None], N[None])[1])[0])
         if gain > best:
             best, words = gain, each.words
@@ -205,10 +205,10 @@ def related(observed: Observed, errors: Errors) -> Relative:
     """Return errors relative to the datum of the model, with the fewest sources."""
     if observed.datum is None:
         none = np.zeros(0)
-        found = Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
+        relative_errors = Relative(errors, none, np.zeros((0, 0)), np.zeros((len(errors.sources), 0)))
     else:
-        found = relative(errors, observed.datum, noise=observed.shared)
-    return fewest(found)
+        relative_errors = relative(errors, observed.datum, noise=observed.shared)
+    return fewest(relative_errors)
 
 
 def identify(model: Model, raw: xr.Dataset, settings: Any, info: MethodInfo) -> xr.Dataset:
@@ -318,15 +318,15 @@ def of_readings(solved: Solved, raw: xr.Dataset) -> dict[str, xr.DataArray]:
 
 def reliability_of(solved: Solved, unit: str) -> dict[str, tuple[Array, dict[str, str]]]:
     """Return redundancy, smallest error that is found and its effect on the result, (n, m), with their attributes."""
-    found = reliability(solved.white, factor=solved.fit_factor, pairs=False)
+    numbers = reliability(solved.white, factor=solved.fit_factor, pairs=False)
     return {
-        "redundancy": (found.redundancy, {"units": "1", "long_name": "share of an error that the residual shows"}),
+        "redundancy": (numbers.redundancy, {"units": "1", "long_name": "share of an error that the residual shows"}),
         "smallest_error": (
-            found.smallest,
+            numbers.smallest,
             {"units": unit, "long_name": "smallest gross error that would be found with a probability of 80 %"},
         ),
         "smallest_error_effect": (
-            found.bias,
+            numbers.bias,
             {"units": "1", "long_name": "largest effect of this error on any result, in its standard uncertainties"},
         ),
     }
@@ -344,25 +344,25 @@ def _shape(observed: Observed) -> tuple[int, ...]:
 
 def _placed(values: Array, observed: Observed, shape: tuple[int, ...]) -> Array:
     """Return values (..., place, d) as (..., 6), NaN for the freedoms that the model does not determine."""
-    found = np.full((*values.shape[:-1], 6), np.nan)
+    placed = np.full((*values.shape[:-1], 6), np.nan)
     for k, name in enumerate(observed.freedoms):
-        found[..., DOF.index(name)] = values[..., k]
-    return found.reshape(*shape, 6)
+        placed[..., DOF.index(name)] = values[..., k]
+    return placed.reshape(*shape, 6)
 
 
 def _square(covariance: Array, observed: Observed, shape: tuple[int, ...]) -> Array:
     """Return covariances (place, d, d) as (..., 6, 6)."""
     which = np.array([DOF.index(name) for name in observed.freedoms])
-    found = np.full((len(covariance), 6, 6), np.nan)
-    found[:, which[:, None], which] = covariance
-    return found.reshape(*shape, 6, 6)
+    square = np.full((len(covariance), 6, 6), np.nan)
+    square[:, which[:, None], which] = covariance
+    return square.reshape(*shape, 6, 6)
 
 
 def _unique(names: list[str]) -> list[str]:
     """Return names with a number where one occurs several times."""
     seen: dict[str, int] = {}
-    found = []
+    unique = []
     for name in names:
         seen[name] = seen.get(name, 0) + 1
-        found.append(name if names.count(name) == 1 else f"{name} {seen[name]}")
-    return found
+        unique.append(name if names.count(name) == 1 else f"{name} {seen[name]}")
+    return unique

@@ -62,19 +62,19 @@ _SAME = 1e-6
 """Relative change of the variance of the noise that ends its estimation."""
 
 
-def scatter_of(observed: Observed, found: Fit) -> tuple[Scatter, Fit]:
+def scatter_of(observed: Observed, solution: Fit) -> tuple[Scatter, Fit]:
     """Return what the residuals say about the noise, and the fit with it: another one if it was estimated."""
     priors, stated = has_priors(observed.problem), observed.problem.noise.stated
     estimated: list[Fit] = []
 
     def estimate() -> tuple[float, float]:
-        at, factor, freedom = estimated_noise(found, refresh=observed.refresh, what=observed.what)
+        at, factor, freedom = estimated_noise(solution, refresh=observed.refresh, what=observed.what)
         estimated.append(at)
         return factor, freedom
 
     scatter = variance_factor(
-        found.chi2,
-        found.freedom,
+        solution.chi2,
+        solution.freedom,
         stated=stated,
         stated_freedom=observed.problem.noise.freedom,
         increase=observed.noise_increases,
@@ -85,7 +85,7 @@ def scatter_of(observed: Observed, found: Fit) -> tuple[Scatter, Fit]:
         size=observed.noise_size,
     )
     larger = not stated or scatter.factor > 1.0
-    return scatter, estimated[0] if estimated and larger else found
+    return scatter, estimated[0] if estimated and larger else solution
 
 
 @dataclass(frozen=True)
@@ -105,15 +105,15 @@ class Neighbours:
         return 2.0 / (2.0 / freedom + (2.0 * self.u / (1.0 - self.phi**2)) ** 2) if self.u > 0 else freedom
 
 
-def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
+def neighbours_of(observed: Observed, solution: Fit) -> Neighbours:
     """Return the correlation of the noise along the order of the readings, if there is one."""
-    if observed.order is None or found.freedom < 2:
+    if observed.order is None or solution.freedom < 2:
         return Neighbours()
     if observed.correlation is not None:
         return Neighbours(observed.correlation)
-    if found.problem.noise.stated and found.chi2 < _NOTHING**2 * found.freedom:
+    if solution.problem.noise.stated and solution.chi2 < _NOTHING**2 * solution.freedom:
         return Neighbours()
-    along = correlated(_of_unknown_noise(observed, found), observed.order, observed.series)
+    along = correlated(_of_unknown_noise(observed, solution), observed.order, observed.series)
     if not along.phi > 0:
         return Neighbours()
     note = doubt = ""
@@ -129,13 +129,13 @@ def neighbours_of(observed: Observed, found: Fit) -> Neighbours:
     return Neighbours(along.phi, along.u_phi, note, doubt)
 
 
-def beyond_of(observed: Observed, found: Fit) -> Observed:
+def beyond_of(observed: Observed, solution: Fit) -> Observed:
     """Return a model with the noise of its readings over time that no redundancy shows, and a sentence on it.
 
     For as many readings as unknowns, with a stated noise, and the time as their order.
     """
     problem, order = observed.problem, observed.order
-    if order is None or found.freedom >= 1 or observed.correlation is not None or not problem.noise.stated:
+    if order is None or solution.freedom >= 1 or observed.correlation is not None or not problem.noise.stated:
         return observed
     known = np.flatnonzero(np.isfinite(order))
     ranked = known[np.argsort(order[known], kind="stable")]
@@ -154,18 +154,18 @@ def beyond_of(observed: Observed, found: Fit) -> Observed:
     return replace(larger, notes=[*observed.notes, said])
 
 
-def _of_unknown_noise(observed: Observed, found: Fit) -> Fit:
+def _of_unknown_noise(observed: Observed, solution: Fit) -> Fit:
     """Return the fit with a noise of unknown size: one that is stated wrongly must not look like a correlation.
 
     Beside priors the size cannot be left open, and is that of the residuals.
     """
-    problem = found.problem
+    problem = solution.problem
     if not problem.noise.stated:
-        return found
+        return solution
     if has_priors(problem):
-        return estimated_noise(found, refresh=observed.refresh, what=observed.what)[0]
+        return estimated_noise(solution, refresh=observed.refresh, what=observed.what)[0]
     unknown = replace(problem, noise=replace(problem.noise, stated=False))
-    return fit(unknown, refresh=observed.refresh, what=observed.what, start=found.linear.at)
+    return fit(unknown, refresh=observed.refresh, what=observed.what, start=solution.linear.at)
 
 
 def fitted(observed: Observed, problem: Problem, before: Fit) -> Fit:
@@ -230,15 +230,15 @@ def rounding_of(observed: Observed, problem: Problem, factor: float) -> Rounding
     """
     shape = column(problem.readings).shape
     variance = np.diagonal(problem.noise.covariance(shape), axis1=1, axis2=2) * factor
-    found = resolution.rounding(problem, np.sqrt(variance), observed.resolution)
+    rounding = resolution.rounding(problem, np.sqrt(variance), observed.resolution)
     smallest = float(np.nanmax(np.abs(column(problem.readings)), initial=0.0)) * _DIGITS
-    if found is None and not problem.noise.stated and float(variance.max(initial=0.0)) <= smallest**2:
+    if rounding is None and not problem.noise.stated and float(variance.max(initial=0.0)) <= smallest**2:
         raise FitError(
             f"{observed.what} do not scatter at all, and do not show the step of their scale: their uncertainty "
             "is unknown. State their noise, or the resolution of the instrument",
             code="readings.noise.unknown",
         )
-    return found
+    return rounding
 
 
 def size_of_noise(observed: Observed, problem: Problem, factor: float) -> str:
@@ -270,7 +270,7 @@ def has_priors(problem: Problem) -> bool:
 
 
 def estimated_noise(
-    found: Fit, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
+    current: Fit, *, refresh: Callable[[Problem, Any], Problem] | None = None, what: str = "the readings"
 ) -> tuple[Fit, float, float]:
     """Return the fit with the noise of its readings by restricted likelihood, its variance factor and freedom.
 
@@ -282,13 +282,13 @@ def estimated_noise(
     FitError
         The readings have no redundancy.
     """
-    problem, size = found.problem, 1.0
+    problem, size = current.problem, 1.0
     for _ in range(_STEPS):
-        factor, freedom = noise_variance(found)
+        factor, freedom = noise_variance(current)
         if not factor > 0:
             break
         size *= float(np.sqrt(factor))
-        found = fit(scaled(problem, size**2), refresh=refresh, what=what, start=found.linear.at)
+        current = fit(scaled(problem, size**2), refresh=refresh, what=what, start=current.linear.at)
         if abs(factor - 1) < _SAME:
             break
-    return found, size**2, freedom
+    return current, size**2, freedom

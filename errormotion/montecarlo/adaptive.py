@@ -237,7 +237,19 @@ def summarise(
             error[:, at] = standard_errors(values, probability)
             low_bounds[:, at], high_bounds[:, at] = confidence(values, probability, FALSE_ALARM / (2 * k))
     tolerance = numerical_tolerance(u, digits)
-    found = np.zeros(k, dtype=bool) if stable is None else stable
+    is_stable = np.zeros(k, dtype=bool) if stable is None else stable
     return Summary(
-        trials, probability, digits, mean, u, central, short, error, low_bounds, high_bounds, tolerance, missing, found
+        trials,
+        probability,
+        digits,
+        mean,
+        u,
+        central,
+        short,
+        error,
+        low_bounds,
+        high_bounds,
+        tolerance,
+        missing,
+        is_stable,
     )

@@ -220,10 +220,10 @@ def evaluate(
             code="monte_carlo.no_values",
         )
     verdict = validate_linear(linear.ravel(), u.ravel(), summary, floor=FLOOR)
-    found = build(errors, where, linear, u, summary, verdict, seed, list(trial_model.sources), run.reasons)
+    result = build(errors, where, linear, u, summary, verdict, seed, list(trial_model.sources), run.reasons)
     if not keep:
         store.remove()
-    return found
+    return result
 
 
 @dataclass
@@ -240,8 +240,8 @@ class _Enough:
         if len(blocks) < 1.25 * self.tested:
             return False
         self.tested = len(blocks)
-        found = validate_linear(self.linear, self.u, summarise(blocks, PROBABILITY, self.digits), floor=FLOOR)
-        open_ = int((found.verdict[np.isfinite(self.linear)] == UNDECIDED).sum())
+        validation = validate_linear(self.linear, self.u, summarise(blocks, PROBABILITY, self.digits), floor=FLOOR)
+        open_ = int((validation.verdict[np.isfinite(self.linear)] == UNDECIDED).sum())
         if self.progress is not None:
             self.progress.note(f"{open_} of {int(np.isfinite(self.linear).sum())} values undecided")
         return open_ == 0
@@ -250,13 +250,13 @@ class _Enough:
 def compute(*task: Any) -> tuple[Array, dict[str, int]]:
     """Execute one task: return values (trial, places times freedoms), and the number of failed trials by reason."""
     given = Task(*task)
-    for what, wanted, found in (
+    for what, wanted, given_value in (
         ("errormotion", given.version, __version__),
         (f"the method {given.method_id}", given.method_version, plugins.get("methods", given.method_id).info.version),
     ):
-        if wanted != found:
+        if wanted != given_value:
             raise RunError(
-                f"expected {what} in version {wanted}; found {found} on a worker. Install it there.",
+                f"expected {what} in version {wanted}; found {given_value} on a worker. Install it there.",
                 code="package.version.differs",
             )
     with _quiet():

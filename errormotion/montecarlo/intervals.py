@@ -31,11 +31,11 @@ def standard_errors(ordered: Array, probability: float) -> tuple[Array, Array]:
     low, q = _ranks(count, probability)
     tail = (1.0 - probability) / 2.0
     step = max(1, round(float(np.sqrt(count * tail * (1.0 - tail)))))
-    found = []
+    errors = []
     for rank in (low, low + q):
         below, above = max(rank - step, 0), min(rank + step, count - 1)
-        found.append((ordered[above] - ordered[below]) / 2.0 * (2 * step / max(above - below, 1)))
-    return found[0], found[1]
+        errors.append((ordered[above] - ordered[below]) / 2.0 * (2 * step / max(above - below, 1)))
+    return errors[0], errors[1]
 
 
 def confidence(ordered: Array, probability: float, alarm: float) -> tuple[Array, Array]:
@@ -49,11 +49,11 @@ def confidence(ordered: Array, probability: float, alarm: float) -> tuple[Array,
     count, tail = len(ordered), (1.0 - probability) / 2.0
     beyond = np.full((1, ordered.shape[1]), np.inf)
     padded = np.concatenate([-beyond, ordered, beyond])  # sample number r, counted from 1, is row r
-    found = []
+    bounds = []
     for q in (tail, 1.0 - tail):
         low, high = (int(binom.ppf(p, count, q)) for p in (alarm / 2, 1.0 - alarm / 2))
-        found.append(np.stack([padded[low], padded[min(high + 1, count + 1)]]))
-    return found[0], found[1]
+        bounds.append(np.stack([padded[low], padded[min(high + 1, count + 1)]]))
+    return bounds[0], bounds[1]
 
 
 def min_samples(probability: float) -> int:

@@ -27,9 +27,9 @@ def catalogue(language: str) -> dict[str, str]:
 def chapters(source: Source) -> list[Part]:
     """Return the chapter of a Monte Carlo evaluation."""
     ds = source.errors
-    found = lines(ds)
+    shown = lines(ds)
     p = 100 * float(ds.attrs["probability"])
-    verdicts, intervals = [_row(line) for line in found], [_intervals(line) for line in found]
+    verdicts, intervals = [_row(line) for line in shown], [_intervals(line) for line in shown]
     how = Text(
         f"{int(ds.attrs['trials'])} trials with seed {int(ds.attrs['seed'])}; each trial repeats the identification by "
         f"{ds.attrs['method']} {ds.attrs['method_version']} with new random draws of all sources (JCGM 101): "
@@ -47,17 +47,17 @@ def chapters(source: Source) -> list[Part]:
         Part(
             f"Monte Carlo evaluation of {ds.attrs['component']} by {ds.attrs['method']}",
             [KeyFigure("trials", Cell(f"{int(ds.attrs['trials'])}"), "")],
-            [verdict(found)],
+            [verdict(shown)],
             [Section("monte-carlo", "Linear intervals and Monte Carlo", [how, *tables, *notes])],
             kind="Monte Carlo evaluation",
         )
     ]
 
 
-def verdict(found: list[Line]) -> str:
+def verdict(rows: list[Line]) -> str:
     """Return one sentence on all freedoms."""
     by_word = {
-        word: [line.name for line in found if line.word == word] for word in ("validated", "not validated", "undecided")
+        word: [line.name for line in rows if line.word == word] for word in ("validated", "not validated", "undecided")
     }
     return (
         "Linear intervals: " + "; ".join(f"{', '.join(names)} {word}" for word, names in by_word.items() if names) + "."

@@ -47,7 +47,7 @@ def build(
     where: Mapping[str, NDArray[np.intp]],
     linear: Array,
     u: Array,
-    found: Summary,
+    summary: Summary,
     validation: Validation,
     seed: int,
     sources: Sequence[str],
@@ -63,7 +63,7 @@ def build(
         Indices of the places along each dimension.
     linear, u : ndarray (place, dof)
         Estimates and standard uncertainties by linear propagation.
-    found : Summary
+    summary : Summary
     validation : Validation
     seed : int
     sources : sequence of str
@@ -80,22 +80,22 @@ def build(
     shape = (*(len(where[dim]) for dim in dims), len(names))
     known = np.isfinite(linear.ravel())
     ends = {
-        "symmetric": found.symmetric,
-        "shortest": found.shortest,
-        "standard_error": found.standard_error,
+        "symmetric": summary.symmetric,
+        "shortest": summary.shortest,
+        "standard_error": summary.standard_error,
         "distance": np.stack([validation.low, validation.high]),
     }
     ones = {
         "linear": linear.ravel(),
         "linear_uncertainty": u.ravel(),
-        "mean": found.mean,
-        "uncertainty": found.uncertainty,
-        "tolerance": found.tolerance,
+        "mean": summary.mean,
+        "uncertainty": summary.uncertainty,
+        "tolerance": summary.tolerance,
     }
     flags: dict[str, NDArray[Any]] = {
         "verdict": np.where(known, validation.verdict, UNDECIDED).astype(np.int8),
-        "stable": found.stable.astype(np.int8),
-        "missing": np.where(known, found.missing, 0).astype(np.int64),
+        "stable": summary.stable.astype(np.int8),
+        "missing": np.where(known, summary.missing, 0).astype(np.int64),
     }
     variables: dict[str, Any] = {
         name: ((*dims, "dof", "limit"), np.where(known, values, np.nan).T.reshape(*shape, 2))
@@ -107,7 +107,7 @@ def build(
     variables |= {name: ((*dims, "dof"), values.reshape(shape)) for name, values in flags.items()}
     places = errors[names].isel({dim: where[dim] for dim in dims})
     own = {name: places[name].variable for name in places.coords if set(map(str, places[name].dims)) <= set(dims)}
-    refused = int(found.missing[known].max(initial=0))
+    refused = int(summary.missing[known].max(initial=0))
     notes = [f"{count} trials failed: {reason}" for reason, count in sorted(reasons.items())]
     if refused and not notes:
         notes = [f"{refused} trials had no value at some places."]
@@ -116,9 +116,9 @@ def build(
     attrs = {name: errors.attrs[name] for name in ATTRIBUTES if name in errors.attrs}
     attrs |= {
         "schema": SCHEMA,
-        "trials": found.trials,
-        "probability": found.probability,
-        "digits": found.digits,
+        "trials": summary.trials,
+        "probability": summary.probability,
+        "digits": summary.digits,
         "seed": seed,
         "sources": list(sources),
         "errors_hash": hash_dataset(as_stored(errors)),
@@ -138,31 +138,31 @@ def build(
 
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema, one sentence each."""
-    found = [f"attribute '{name}': missing" for name in (*ATTRIBUTES[:5], *NUMBERS) if name not in ds.attrs]
+    messages = [f"attribute '{name}': missing" for name in (*ATTRIBUTES[:5], *NUMBERS) if name not in ds.attrs]
     linear = ds.variables.get("linear")
     own = [] if linear is None else [str(dim) for dim in linear.dims if dim != "dof"]
     for name, (dims, meaning) in TABLE.items():
         if name not in ds.variables:
-            found.append(f"{name}: missing; expected {meaning}")
+            messages.append(f"{name}: missing; expected {meaning}")
             continue
         expected = tuple(part for dim in dims for part in (own if dim == "..." else [dim]))
         if ds.variables[name].dims != expected:
-            found.append(f"{name}: expected dims ({', '.join(expected)}); found {ds.variables[name].dims}")
+            messages.append(f"{name}: expected dims ({', '.join(expected)}); found {ds.variables[name].dims}")
         if ds.variables[name].dtype.kind not in "iuf":
-            found.append(f"{name}: expected numbers; found {ds.variables[name].dtype}")
+            messages.append(f"{name}: expected numbers; found {ds.variables[name].dtype}")
     for name, known in LABELS.items():
         labels = [str(label) for label in np.ravel(ds.coords[name].values)] if name in ds.coords else []
         if not labels or len(set(labels)) < len(labels) or not set(labels) <= set(known):
-            found.append(
+            messages.append(
                 f"{name}: expected labels of {', '.join(known)}, each once; found {', '.join(labels) or 'none'}"
             )
     for name in NUMBERS:
         stated = ds.attrs.get(name, 0)
         if not isinstance(stated, int | float | np.number) or not np.isfinite(stated):
-            found.append(f"attribute '{name}': expected a number; found {stated!r:.80}")
-    if not found and not np.isin(ds["verdict"].values, (VALIDATED, NOT_VALIDATED, UNDECIDED)).all():
-        found.append("verdict: expected 1, 0 or -1")
-    return found
+            messages.append(f"attribute '{name}': expected a number; found {stated!r:.80}")
+    if not messages and not np.isin(ds["verdict"].values, (VALIDATED, NOT_VALIDATED, UNDECIDED)).all():
+        messages.append("verdict: expected 1, 0 or -1")
+    return messages
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def lines(ds: xr.Dataset) -> list[Line]:
 
     own = [str(dim) for dim in ds["linear"].dims if dim != "dof"]
     factor = float(ndtri(0.5 + float(ds.attrs["probability"]) / 2))
-    found = []
+    rows = []
     for name in map(str, ds["dof"].values):
         one = ds.sel(dof=name)
         y, u, tolerance, verdict = (
@@ -228,9 +228,9 @@ def lines(ds: xr.Dataset) -> list[Line]:
         at = int(np.argmax(candidates))
         low, high = one["symmetric"].transpose(*own, "limit").values.reshape(-1, 2)[at]
         place = place_of(one, own, np.unravel_index(at, [one.sizes[dim] for dim in own]) if own else ())
-        found.append(
+        rows.append(
             Line(name, value, float(u[at]), float(one["uncertainty"].values.ravel()[at]), float(tolerance[at]),
                  float(distance[at]), (float(y[at] - factor * u[at]), float(y[at] + factor * u[at])),
                  (float(low), float(high)), place, int((worst != VALIDATED).sum()), int(moving.sum()))
         )  # fmt: skip
-    return found
+    return rows

@@ -45,12 +45,12 @@ def evaluate_and_save(
     """
     folder = file.with_suffix(".trials")
     try:
-        found = evaluate(
+        result = evaluate(
             raw, method_id, settings, errors, folder, trials=trials, digits=digits, seed=seed, scheduler=scheduler,
             workers=workers, progress=progress, keep=True,
         )  # fmt: skip
     except KeyboardInterrupt as error:
         raise KeyboardInterrupt(f"The trials are kept in {folder}; repeat the command to continue.") from error
-    datasets.save(found, evaluation_file(file))
+    datasets.save(result, evaluation_file(file))
     Store(folder, {}).remove()
-    return found
+    return result

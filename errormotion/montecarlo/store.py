@@ -46,11 +46,11 @@ class Store:
         try:
             make_folder(self.folder)
             if file.exists():
-                found = json.loads(_small(file))
-                if found != self._key:
-                    keys = set(self._key) | set(found if isinstance(found, dict) else {})
+                stored = json.loads(_small(file))
+                if stored != self._key:
+                    keys = set(self._key) | set(stored if isinstance(stored, dict) else {})
                     differ = [
-                        k for k in sorted(keys) if not isinstance(found, dict) or found.get(k) != self._key.get(k)
+                        k for k in sorted(keys) if not isinstance(stored, dict) or stored.get(k) != self._key.get(k)
                     ]
                     raise RunError(
                         f"{self.folder}: contains trials of another evaluation ({', '.join(differ)} differ). Remove "
@@ -81,15 +81,15 @@ class Store:
 
     def chunks(self, number: int, size: int) -> list[range]:
         """Return the stored trials of a block."""
-        found = []
+        stored = []
         for file in sorted(self.folder.glob(f"block-{number:04d}-*.npy")):
             match = _CHUNK.fullmatch(file.name)
             if match is None:
                 continue
             first, stop = int(match[2]), int(match[3])
             if first < stop <= size and self._read(file, stop - first) is not None:
-                found.append(range(first, stop))
-        return found
+                stored.append(range(first, stop))
+        return stored
 
     def keep(self, number: int, trials: range, values: Array) -> None:
         """Write some trials (n, k) of a block."""

@@ -27,15 +27,15 @@ def trial_model_of(method: Any, raw: xr.Dataset, settings: Any, errors: xr.Datas
     MethodError
         The method has no trial model, or the result of its reduced data is not that of the measured data.
     """
-    found: TrialModel | None = method.trial_model(raw, settings, errors) if states(method, "trial_model") else None
-    if found is None:
+    model: TrialModel | None = method.trial_model(raw, settings, errors) if states(method, "trial_model") else None
+    if model is None:
         raise MethodError(
             f"The method {method.info.id} {method.info.version} cannot be evaluated by the Monte Carlo method: it has "
             "no 'trial_model'. Its linear uncertainty is not affected.",
             code="monte_carlo.method.no_trial_model",
         )
-    check_centre((found.identify or method.identify)(found.raw, found.settings), errors)
-    return found
+    check_centre((model.identify or method.identify)(model.raw, model.settings), errors)
+    return model
 
 
 def check_centre(centre: xr.Dataset, errors: xr.Dataset) -> None:

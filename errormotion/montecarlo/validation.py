@@ -38,7 +38,7 @@ class Validation:
 def validate_linear(
     value: Array,
     uncertainty: Array,
-    found: Summary,
+    summary: Summary,
     *,
     factor: float | None = None,
     floor: float = 0.0,
@@ -50,7 +50,7 @@ def validate_linear(
     ----------
     value, uncertainty : ndarray (k,)
         Estimate and standard uncertainty by linear propagation.
-    found : Summary
+    summary : Summary
         Results of the trials.
     factor : float, optional
         Coverage factor; default that of the normal distribution.
@@ -65,17 +65,17 @@ def validate_linear(
     with a probability of 95 %. A quantity is decided if all values within the bounds are inside the tolerance, or all
     outside.
     """
-    k = float(ndtri(0.5 + found.probability / 2)) if factor is None else factor
+    k = float(ndtri(0.5 + summary.probability / 2)) if factor is None else factor
     ends = np.stack([value - k * uncertainty, value + k * uncertainty])
-    seen = found.shortest if short else found.symmetric
+    seen = summary.shortest if short else summary.symmetric
     distance = np.abs(ends - seen)
     known = np.isfinite(distance).all(axis=0)
-    limit = np.maximum(found.tolerance, floor)
+    limit = np.maximum(summary.tolerance, floor)
     with np.errstate(invalid="ignore"):
-        bounds = np.stack([found.low_bounds, found.high_bounds], axis=1) + (seen - found.symmetric)
+        bounds = np.stack([summary.low_bounds, summary.high_bounds], axis=1) + (seen - summary.symmetric)
         off = bounds - ends
         inside = np.all(np.abs(off) <= limit, axis=(0, 1)) | np.all(distance <= floor, axis=0)
         outside = np.any((off[0] > limit) | (off[1] < -limit), axis=0)
     verdict = np.where(inside, VALIDATED, np.where(outside, NOT_VALIDATED, UNDECIDED))
-    verdict[~known | (found.missing > MAX_MISSING * found.trials)] = UNDECIDED
+    verdict[~known | (summary.missing > MAX_MISSING * summary.trials)] = UNDECIDED
     return Validation(distance[0], distance[1], verdict.astype(np.int8))

@@ -58,7 +58,7 @@ def aliases(
     frequency: float, rate: float, count: int, *, orders: int = ORDERS, spread: float = SPREAD, left: float = LEFT
 ) -> list[Alias]:
     """Return the harmonics of a frequency (Hz) that means over ``count`` samples of a rate (Hz) contain."""
-    found = []
+    result = []
     for order in range(1, orders + 1):
         f = order * frequency
         # half a lobe of the share is rate / (2 count) wide
@@ -68,5 +68,5 @@ def aliases(
             near = np.append(near, rate * np.floor(near[-1] / rate))
         share = float(share_left(near, rate, count).max())
         if share > left:
-            found.append(Alias(order, abs(f - rate * round(f / rate)), share))
-    return found
+            result.append(Alias(order, abs(f - rate * round(f / rate)), share))
+    return result

@@ -92,12 +92,12 @@ class Correlated:
         return np.asarray(2.0 / np.maximum(own + np.square(slope) * self.u_phi**2, 1e-12))
 
 
-def correlated(found: Fit, order: Array, series: Index | None = None, *, typical: float = TYPICAL) -> Correlated:
+def correlated(white: Fit, order: Array, series: Index | None = None, *, typical: float = TYPICAL) -> Correlated:
     """Return the fit with noise that is correlated along an order, with the correlation that is most likely.
 
     Parameters
     ----------
-    found : Fit
+    white : Fit
         With white noise.
     order : ndarray, (n,)
         Time or position of each reading; the median step is the unit of phi.
@@ -108,7 +108,7 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
     """
     from scipy.optimize import minimize_scalar
 
-    problem, at = found.problem, found.linear.at
+    problem, at = white.problem, white.linear.at
     near = _linear(problem, at)
 
     def deviance(phi: float) -> float:
@@ -121,7 +121,7 @@ def correlated(found: Fit, order: Array, series: Index | None = None, *, typical
     points = np.array([low, low + _STEP, low + 2 * _STEP])
     values = [deviance(float(p)) for p in points]
     curvature = (values[0] - 2 * values[1] + values[2]) / _STEP**2
-    n = max(int(found.linear.used.any(axis=1).sum()), 1)
+    n = max(int(white.linear.used.any(axis=1).sum()), 1)
     u_phi = float(np.sqrt(2.0 / max(curvature, 1e-3 * n)))
     return Correlated(
         phi=phi,
@@ -138,10 +138,10 @@ def _linear(problem: Problem, at: Unknown) -> Problem:
         return problem
     names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
     values = [*at.tables, *problem.constant_tables(at)]
-    found = by_rows(
+    derivative_arrays = by_rows(
         lambda rows: problem.evaluate(problem.y, rows), problem.tables, values, range(len(names)), weighed=False
     )
-    derivatives = dict(zip(names, found, strict=True))
+    derivatives = dict(zip(names, derivative_arrays, strict=True))
     return replace(problem, derivatives=lambda *_: derivatives)
 
 
@@ -202,7 +202,7 @@ def autoregressive(problem: Problem, order: Array, phi: float, series: Index | N
         given = problem.derivatives
         if given is None:
             return {}
-        found = {}
+        by_name = {}
         named = problem.named(rows[:count], rows[count:])
         names = [*problem.unknowns._fields, *getattr(problem.constants, "_fields", ())]
         its_table = dict(zip(names, problem.tables, strict=True))
@@ -212,8 +212,8 @@ def autoregressive(problem: Problem, order: Array, phi: float, series: Index | N
             weight = its_table[name].weight
             whole = J[:, :, None, :] if J.ndim == 3 else J
             whole = whole if weight is None else whole * weight[:, None, :, None]
-            found[name] = np.concatenate([whole, -coefficient[:, :, None, None] * whole[chain.before]], axis=2)
-        return found
+            by_name[name] = np.concatenate([whole, -coefficient[:, :, None, None] * whole[chain.before]], axis=2)
+        return by_name
 
     unknowns, constants = problem.named(tables[:count], tables[count:])  # type: ignore[arg-type]
     return replace(
@@ -236,11 +236,11 @@ def coloured(z: Array, used: NDArray[np.bool_], order: Array, phi: float, series
     chain = _Chain.between(used, order, series)
     power = np.where(chain.first, 0.0, phi**chain.distance)[:, None]
     step = np.sqrt(1 - np.square(power)) * z
-    found = step.copy()
+    noise = step.copy()
     at = np.flatnonzero(chain.first)
     while (at := chain.after[at][chain.after[at] >= 0]).size:  # one reading of each series at a time
-        found[at] = power[at] * found[chain.before[at]] + step[at]
-    return np.asarray(found)
+        noise[at] = power[at] * noise[chain.before[at]] + step[at]
+    return np.asarray(noise)
 
 
 def with_trend(
@@ -277,13 +277,13 @@ def with_trend(
     return with_linear(problem, name, design, index=which, group=group)
 
 
-def lag_one(found: Fit, order: Array, series: Index | None = None) -> float:
+def lag_one(white: Fit, order: Array, series: Index | None = None) -> float:
     """Return the correlation of normalised residuals with their neighbours along an order; about 0 for white noise.
 
     ``sum (r_t r_(t-1)) / sum r^2``; the fit makes it smaller by about ``(unknowns + 1) / n``.
     """
-    chain = _Chain.of(found.problem, order, series)
-    r = np.where(found.linear.used, found.linear.residual, 0.0)
+    chain = _Chain.of(white.problem, order, series)
+    r = np.where(white.linear.used, white.linear.residual, 0.0)
     follows = ~chain.first
     pairs = float(np.sum(r[follows] * r[chain.before[follows]]))
     return pairs / max(float(np.vdot(r, r)), 1e-300) * len(r) / max(int(follows.sum()), 1)
@@ -304,11 +304,11 @@ def _deviance(problem: Problem, at: Unknown, order: Array, series: Index | None,
     x, z = normal.solve(a[..., None], b[..., None])
     square = linear.chi2 + linear.prior_square() - float(np.vdot(a, x[..., 0])) - float(b @ z[:, 0])
     roots = np.diagonal(linear.whitener, axis1=1, axis2=2)[linear.used]
-    found = -2 * float(np.log(roots).sum()) + normal.log_determinant
+    determinants = -2 * float(np.log(roots).sum()) + normal.log_determinant
     if problem.noise.stated:
-        return found + square
+        return determinants + square
     freedom = int(linear.used.sum()) - sum(int(block.freed.sum()) for block in problem.unknowns)
-    return found + max(freedom, 1) * float(np.log(max(square, 1e-300)))
+    return determinants + max(freedom, 1) * float(np.log(max(square, 1e-300)))
 
 
 def _independent(problem: Problem, order: Array, series: Index | None, phi: float) -> float:
@@ -391,6 +391,6 @@ class _Chain:
     def scattered(self, earlier: Array, now: Array) -> Array:
         """Return what each reading's successor has as the values before it; its own where there is none."""
         has = self.after >= 0
-        found = now.copy()
-        found[has] = earlier[self.after[has]]
-        return found
+        values = now.copy()
+        values[has] = earlier[self.after[has]]
+        return values

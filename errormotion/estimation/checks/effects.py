@@ -92,14 +92,14 @@ class Numbers:
         """Return the whitened derivatives by these numbers, (rows, m, k each), and the readings that are the rows."""
         rows = np.unique(np.array([i for i, _ in where], dtype=np.intp))
         m = self.W.shape[1]
-        found = np.zeros((rows.size, m, len(where) * self.k))
+        columns = np.zeros((rows.size, m, len(where) * self.k))
         for j, (i, number) in enumerate(where):
             row = int(np.searchsorted(rows, i))
             if self.whole:
-                found[row, :, j * self.k : (j + 1) * self.k] = np.eye(m)
+                columns[row, :, j * self.k : (j + 1) * self.k] = np.eye(m)
             else:
-                found[row, :, j] = self.W[i, :, number]
-        return found, rows
+                columns[row, :, j] = self.W[i, :, number]
+        return columns, rows
 
     def root(self, at: At) -> Array:
         """Return the inverse of the whitener of a reading, (m, m); 0 for missing numbers."""

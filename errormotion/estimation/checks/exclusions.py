@@ -92,27 +92,27 @@ class Cleaned:
     @property
     def excluded(self) -> Flags:
         """All excluded readings, in the shape of the readings."""
-        found = np.zeros(self.fit.problem.readings.shape, dtype=bool)
+        flags = np.zeros(self.fit.problem.readings.shape, dtype=bool)
         for each in self.made:
-            found |= each.readings
-        return found
+            flags |= each.readings
+        return flags
 
 
-def notes(found: Cleaned, what: str = "readings") -> list[str]:
+def notes(search: Cleaned, what: str = "readings") -> list[str]:
     """Return a sentence on what was excluded; none for valid data."""
     texts = []
-    if found.made:
-        shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in found.made[:SHOWN]]
-        more = f", and {len(found.made) - SHOWN} more" if len(found.made) > SHOWN else ""
-        count = int(found.excluded.reshape(len(found.excluded), -1).any(axis=1).sum())
+    if search.made:
+        shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in search.made[:SHOWN]]
+        more = f", and {len(search.made) - SHOWN} more" if len(search.made) > SHOWN else ""
+        count = int(search.excluded.reshape(len(search.excluded), -1).any(axis=1).sum())
         done = f"{count} of them {'is' if count == 1 else 'are'} not used" if count else "their effect is estimated"
         texts.append(f"Some {what} contradict the others ({'; '.join(shown)}{more}); {done}.")
     return texts
 
 
-def kept(found: Cleaned, what: str = "readings") -> list[str]:
+def kept(search: Cleaned, what: str = "readings") -> list[str]:
     """Return a sentence on outliers that are used nevertheless, since the result is that of all readings."""
-    listed = [*found.made, *found.undecided]
+    listed = [*search.made, *search.undecided]
     if not listed:
         return []
     words = [each.words + "".join(f" or {other}" for other in each.rivals) for each in listed[:SHOWN]]
@@ -123,10 +123,10 @@ def kept(found: Cleaned, what: str = "readings") -> list[str]:
     ]
 
 
-def doubts(found: Cleaned, what: str = "readings") -> list[str]:
+def doubts(search: Cleaned, what: str = "readings") -> list[str]:
     """Return a sentence on each contradiction that remains, so that no uncertainty can be relied on."""
     texts = []
-    for each in found.undecided:
+    for each in search.undecided:
         if each.rivals:
             texts.append(
                 f"One of {', '.join([each.words, *each.rivals])} is wrong, and the other {what} do not show which; "
@@ -210,19 +210,19 @@ class _Search:
     barred: set[str] = field(default_factory=set)
 
     def run(self) -> Cleaned:
-        found = self.fitted(self.problem)
-        self.whole = self.whole or found.linear.used.shape != column(self.problem.readings).shape
+        current = self.fitted(self.problem)
+        self.whole = self.whole or current.linear.used.shape != column(self.problem.readings).shape
         open_ = np.zeros(self.problem.readings.shape, dtype=bool)
         for _ in range(MAX_PASSES):
-            better, more = self.searched(found)
+            better, more = self.searched(current)
             open_ |= more
             if better is None:
                 if open_.any():
-                    readings = np.where(open_, self.problem.readings, found.problem.readings)
-                    found = self.fitted(replace(found.problem, readings=readings), found)
-                unchecked = found.linear.used & (Numbers(found, self.whole).redundancy <= MIN_REDUNDANCY)
-                return Cleaned(found, tuple(self.made), tuple(self.undecided), unchecked)
-            found = better
+                    readings = np.where(open_, self.problem.readings, current.problem.readings)
+                    current = self.fitted(replace(current.problem, readings=readings), current)
+                unchecked = current.linear.used & (Numbers(current, self.whole).redundancy <= MIN_REDUNDANCY)
+                return Cleaned(current, tuple(self.made), tuple(self.undecided), unchecked)
+            current = better
         raise FitError(
             f"more than {MAX_PASSES} searches for outliers among {self.what} have found more of them; check units, "
             "the order of the readings and their stated noise",
@@ -245,16 +245,16 @@ class _Search:
             return problem
         return replace(self.refresh(problem, x), readings=problem.readings)
 
-    def searched(self, found: Fit) -> tuple[Fit | None, Flags]:
+    def searched(self, current: Fit) -> tuple[Fit | None, Flags]:
         """Return the fit after the most improbable exclusions, None if there are none; and what is undecided."""
         none = np.zeros(self.problem.readings.shape, dtype=bool)
-        if found.freedom < 1:
+        if current.freedom < 1:
             return None, none
-        numbers = Numbers(found, self.whole)
-        structures = self.structures(found)
+        numbers = Numbers(current, self.whole)
+        structures = self.structures(current)
         trials = int(numbers.tested.sum()) + sum(each.candidate.trials for each in structures)
         largest = max((each.gain for each in structures), default=0.0)
-        search = Sequence(found, numbers, largest, float(np.log(self.false_alarm / max(trials, 1))))
+        search = Sequence(current, numbers, largest, float(np.log(self.false_alarm / max(trials, 1))))
         suspects, noise = search.suspects(), search.noise
         structures.sort(key=lambda each: noise.chance(each.gain, each.k))
         if structures:
@@ -265,22 +265,22 @@ class _Search:
                 alone = [noise.chance(float(numbers.gain[each.at]), numbers.k) for each in suspects]
                 suspects = [each for each, own in zip(suspects, alone, strict=True) if own <= chance + RIVAL / 2]
                 if not suspects:
-                    return self.structured(found, structures, chance, trials, noise.unit), none
-        return self.excluded(found, suspects, trials) if suspects else (None, none)
+                    return self.structured(current, structures, chance, trials, noise.unit), none
+        return self.excluded(current, suspects, trials) if suspects else (None, none)
 
-    def structures(self, found: Fit) -> list[_Structure]:
+    def structures(self, current: Fit) -> list[_Structure]:
         """Return the candidates with their effects."""
         listed = []
-        for each in () if self.suspects is None else self.suspects(found):
+        for each in () if self.suspects is None else self.suspects(current):
             J = each.design[:, None, :] if each.design.ndim == 2 else each.design
             rows = np.flatnonzero(J.any(axis=(1, 2)))
-            white = found.linear.whitener[rows] @ J[rows]
-            size, gain, rank = solved(*reduced(found, white, rows), 1e-6 * float(np.vdot(white, white)))
+            white = current.linear.whitener[rows] @ J[rows]
+            size, gain, rank = solved(*reduced(current, white, rows), 1e-6 * float(np.vdot(white, white)))
             if rank and np.linalg.norm(size) >= each.smallest and each.words not in self.barred:
                 listed.append(_Structure(each, size, float(gain), int(rank)))
         return listed
 
-    def excluded(self, found: Fit, suspects: list[Suspect], trials: int) -> tuple[Fit, Flags]:
+    def excluded(self, current: Fit, suspects: list[Suspect], trials: int) -> tuple[Fit, Flags]:
         """Return the fit without these numbers, and those of them that are undecided."""
         wrong = np.zeros(self.problem.readings.shape, dtype=bool)
         open_ = wrong.copy()
@@ -296,15 +296,15 @@ class _Search:
                 readings=out,
                 rivals=tuple(self.words(at) for at in each.rivals),
             )
-            if each.rivals and not self.possible(found, wrong | out):
+            if each.rivals and not self.possible(current, wrong | out):
                 self.undecided.append(one)
                 open_ |= self.flags(each.at)
             else:
                 self.made.append(one)
                 wrong |= out
-        return self.fitted(found.problem.without(wrong | open_), found), open_
+        return self.fitted(current.problem.without(wrong | open_), current), open_
 
-    def structured(self, found: Fit, structures: list[_Structure], chance: float, trials: int, unit: float) -> Fit:
+    def structured(self, current: Fit, structures: list[_Structure], chance: float, trials: int, unit: float) -> Fit:
         """Return the fit without the readings of the best candidate, or with its unknowns."""
         best = structures[0]
         candidate = best.candidate
@@ -320,32 +320,32 @@ class _Search:
             rivals=tuple(each.candidate.words for each in structures[1:] if each.gain > best.gain - RIVAL * unit),
         )
         if candidate.excluded is None:
-            problem = with_linear(found.problem, f"added_{len(self.made) + 1}", candidate.design, group=one.words)
+            problem = with_linear(current.problem, f"added_{len(self.made) + 1}", candidate.design, group=one.words)
         else:
-            problem = found.problem.without(out)
+            problem = current.problem.without(out)
         self.barred.add(candidate.words)
         try:
-            better = self.fitted(problem, found)
+            better = self.fitted(problem, current)
         except FitError:
             self.undecided.append(one)
-            return found
+            return current
         self.made.append(one)
         return better
 
     def flags(self, at: At) -> Flags:
         """Return the readings that are excluded with a number."""
-        found = np.zeros(self.problem.readings.shape, dtype=bool)
-        found[at[:1] if self.whole or found.ndim == 1 else at] = True
-        return found
+        flags = np.zeros(self.problem.readings.shape, dtype=bool)
+        flags[at[:1] if self.whole or flags.ndim == 1 else at] = True
+        return flags
 
     def words(self, at: At) -> str:
         """Return the name of a number."""
         return self.name(np.array(at[:1] if self.whole or self.problem.readings.ndim == 1 else at))
 
-    def possible(self, found: Fit, wrong: Flags) -> bool:
+    def possible(self, current: Fit, wrong: Flags) -> bool:
         """Return whether the readings without ``wrong`` determine all unknowns."""
         try:
-            self.fitted(found.problem.without(wrong), found)
+            self.fitted(current.problem.without(wrong), current)
         except FitError:
             return False
         return True

@@ -67,12 +67,12 @@ class Reliability:
     @property
     def worst(self) -> list[tuple[At, float]]:
         """For each function the number whose undetected error has the largest effect, and this effect."""
-        found = []
+        rows = []
         for k in range(self.effect.shape[2]):
             size = np.where(np.isfinite(self.redundancy), np.abs(self.effect[..., k]), -np.inf)
             i, j = np.unravel_index(int(np.argmax(size)), size.shape)
-            found.append(((int(i), int(j)), float(self.effect[i, j, k])))
-        return found
+            rows.append(((int(i), int(j)), float(self.effect[i, j, k])))
+        return rows
 
 
 def reliability(

@@ -166,12 +166,12 @@ def rounding_of_means(sd: Array, count: Array, step: float) -> Rounding | None:
     return Rounding(step, np.full(sd.shape, b), noise) if b**2 > _NOTICEABLE * float(np.median(sd)) ** 2 else None
 
 
-def sentence(what: str, found: Rounding, unit: str = "m") -> str:
+def sentence(what: str, rounding: Rounding, unit: str = "m") -> str:
     """Return the sentence on rounded readings; ``what`` is its subject."""
     factor, name = {"m": (1e6, "um"), "rad": (1e6, "urad")}.get(unit, (1.0, unit))
     return (
-        f"{what[:1].upper()}{what[1:]} are multiples of {found.step * factor:.3g} {name}, with a noise of "
-        f"{found.noise * factor:.3g} {name} before rounding: rounding is a part of the uncertainties."
+        f"{what[:1].upper()}{what[1:]} are multiples of {rounding.step * factor:.3g} {name}, with a noise of "
+        f"{rounding.noise * factor:.3g} {name} before rounding: rounding is a part of the uncertainties."
     )
 
 

@@ -39,20 +39,20 @@ SIGNIFICANT = 0.02
 
 def spikes(values: Array, *, false_alarm: float = FALSE_ALARM) -> NDArray[np.bool_]:
     """Return which values (n,) stand out from both neighbours; one beside a missing value (NaN) has no two of them."""
-    found = np.zeros(values.shape, dtype=bool)
+    is_spike = np.zeros(values.shape, dtype=bool)
     if values.size < FEWEST:
-        return found
+        return is_spike
     d = values[1:-1] - (values[:-2] + values[2:]) / 2
     count = int(np.isfinite(d).sum())
     if count < FEWEST - 2:
-        return found
+        return is_spike
     # a value on the next mark of a coarse scale is no spike
     s = np.hypot(scale_about_zero(d) / np.sqrt(1.5), step_of(values) / 2)
     limit = -float(stdtrit(_EFFICIENCY * count, false_alarm / (2 * count))) * np.sqrt(1.5) * s
     beside = np.concatenate([[np.nan], d, [np.nan]])
     is_half = [~(np.abs(each + d / 2) > np.abs(d) / 4 + limit / 2) for each in (beside[:-2], beside[2:])]
-    found[1:-1] = (np.abs(d) > limit) & is_half[0] & is_half[1]
-    return found
+    is_spike[1:-1] = (np.abs(d) > limit) & is_half[0] & is_half[1]
+    return is_spike
 
 
 @dataclass(frozen=True)

@@ -70,14 +70,14 @@ class SlowNoise:
     duration: float
 
 
-def sentence(found: SlowNoise, sizes: str, what: str = "the readings") -> str:
+def sentence(noise: SlowNoise, sizes: str, what: str = "the readings") -> str:
     """Return the sentences on further noise, with its ``sizes`` in words; they doubt uncertainties if it is alike."""
     subject = what[:1].upper() + what[1:]
-    if not found.duration > 0:
+    if not noise.duration > 0:
         return f"{subject} scatter about smooth curves by more than their noise ({sizes}); the uncertainty contains it."
     return (
         f"{subject} vary about smooth curves by more than their noise ({sizes}), alike for about "
-        f"{found.duration:.2g} s. The uncertainty of each error contains it, that of a mean or a slope over several "
+        f"{noise.duration:.2g} s. The uncertainty of each error contains it, that of a mean or a slope over several "
         "instants does not. A motion that is as fast looks the same."
     )
 
@@ -96,7 +96,7 @@ def slow_noise(time: Array, values: Array, sd: Array, breaks: Sequence[float] = 
     """
     known = np.isfinite(values).all(axis=0) & (sd > 0).all(axis=0)
     stretch = np.searchsorted(np.sort(np.asarray(breaks, dtype=float)), time, side="right")
-    found, duration = np.zeros(len(values)), 0.0
+    size, duration = np.zeros(len(values)), 0.0
     tests = list(_stretches(time[known], stretch[known]))
     for m, part in tests:
         at = np.flatnonzero(known)[part]
@@ -107,10 +107,10 @@ def slow_noise(time: Array, values: Array, sd: Array, breaks: Sequence[float] = 
         relative = np.mean(np.square(s / usual), axis=0)
         ratio, phi = _beyond(t, y / usual * np.sqrt(m), relative, float(np.log(len(tests))))
         beyond = np.sqrt(ratio / m) * usual[:, 0]
-        if (beyond > found).any():
-            found = np.maximum(found, beyond)
+        if (beyond > size).any():
+            size = np.maximum(size, beyond)
             duration = max(duration, float(np.median(np.diff(t))) / -np.log(phi) if phi > 0 else 0.0)
-    return SlowNoise(found, duration) if found.any() else None
+    return SlowNoise(size, duration) if size.any() else None
 
 
 def _stretches(time: Array, stretch: Index) -> list[tuple[int, slice]]:
@@ -120,12 +120,12 @@ def _stretches(time: Array, stretch: Index) -> list[tuple[int, slice]]:
         return []
     k = int(np.argmax(np.diff(edges)))
     first, end = int(edges[k]), int(edges[k + 1])
-    found, m = [], 1
+    lengths, m = [], 1
     interval = float(np.median(np.diff(time[first:end]))) if end - first > 1 else np.inf
     while (count := min((end - first) // m, _MOST)) >= FEWEST and (m == 1 or count * m * interval <= LONGEST):
-        found.append((m, slice(end - count * m, end)))
+        lengths.append((m, slice(end - count * m, end)))
         m *= _LENGTHS
-    return found
+    return lengths
 
 
 def _beyond(t: Array, z: Array, relative: Array, more: float) -> tuple[Array, float]:
@@ -149,7 +149,7 @@ def _beyond(t: Array, z: Array, relative: Array, more: float) -> tuple[Array, fl
             logs[i, j] = _log_likelihood(K, white + rho * R, y) - base
     together = logs[:, :, :count].sum(axis=2)
     likely = together.argmax()
-    found, correlation = np.zeros(count), 0.0
+    size, correlation = np.zeros(count), 0.0
     of_all = _mean(together) > ODDS[0] + more
     for c in range(count):
         own = logs[:, :, count + c]
@@ -157,9 +157,9 @@ def _beyond(t: Array, z: Array, relative: Array, more: float) -> tuple[Array, fl
         if of_all or alone:
             log = own if alone else together
             weight = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
-            found[c] = float((weight * _RHO).sum())
+            size[c] = float((weight * _RHO).sum())
             correlation = max(correlation, float((weight * np.array(_PHI)[:, None]).sum()))
-    return found, correlation
+    return size, correlation
 
 
 def _mean(logs: Array) -> float:
@@ -172,5 +172,5 @@ def _log_likelihood(K: Array, N: Array, y: Array) -> Array:
     values, vectors = eigh(K, N)
     w = vectors.T @ y
     v = 1.0 + _AMPLITUDES[:, None] * np.maximum(values, 0.0)
-    found = np.log(v).sum(axis=1)[:, None] + (1.0 / v) @ np.square(w) + np.linalg.slogdet(N)[1]
-    return np.asarray(-0.5 * found.min(axis=0))
+    deviance = np.log(v).sum(axis=1)[:, None] + (1.0 / v) @ np.square(w) + np.linalg.slogdet(N)[1]
+    return np.asarray(-0.5 * deviance.min(axis=0))

@@ -63,8 +63,8 @@ class Scale:
         if rest < 1:
             return 0.0
         scale = max((self.square - gain) / rest, 1e-15 * gain / k)
-        found = float(log_f_tail(np.array(gain / k / scale), k, rest))
-        return max(found, plain) if self.stated else found
+        log_chance = float(log_f_tail(np.array(gain / k / scale), k, rest))
+        return max(log_chance, plain) if self.stated else log_chance
 
     def without(self, gain: float, k: int) -> Scale:
         """Return the noise once a gain is excluded."""
@@ -171,14 +171,14 @@ class Sequence:
     def _followed(self, count: int) -> list[tuple[int, float]]:
         """Return the first numbers of the sequence with their gains."""
         u, N = self.u, self.N
-        found = list[tuple[int, float]]()
+        steps = list[tuple[int, float]]()
         for _ in range(count):
             gain = self._effects(u, N)[1]
-            gain[[j for j, _ in found]] = 0.0
+            gain[[j for j, _ in steps]] = 0.0
             j = int(np.argmax(gain))
-            found.append((j, float(gain[j])))
+            steps.append((j, float(gain[j])))
             u, N = swept(u, N, self._part(j))
-        return found
+        return steps
 
     def _given(self, j: int, others: list[int]) -> Suspect:
         """Return a number given that others are excluded, with its rivals."""

@@ -171,8 +171,8 @@ def largest(errors: Array, covariance: Array, shared: Array) -> Largest:
     length = np.linalg.norm(errors, axis=-1)
     place = int(length.argmax())
     value = float(errors[place, 0] if errors.shape[1] == 1 else length[place])
-    found = _of_lengths(lambda lengths: lengths.max(axis=-1), errors, covariance, shared)
-    return Largest(place, value, float(found.bias), float(found.u))
+    distribution = _of_lengths(lambda lengths: lengths.max(axis=-1), errors, covariance, shared)
+    return Largest(place, value, float(distribution.bias), float(distribution.u))
 
 
 def root_mean_square(errors: Array, covariance: Array, shared: Array) -> Extremes:

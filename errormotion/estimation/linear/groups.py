@@ -72,9 +72,9 @@ class Groups:
         shape = (g, c * values.shape[1], *values.shape[2:])
         if self._plain:
             return values.reshape(shape)
-        found = values.take(np.minimum(self.member, max(len(values) - 1, 0)), axis=0)
-        found[self.member == len(values)] = 0.0
-        return found.reshape(shape)
+        members = values.take(np.minimum(self.member, max(len(values) - 1, 0)), axis=0)
+        members[self.member == len(values)] = 0.0
+        return members.reshape(shape)
 
     def spread(self, values: Array, m: int) -> Array:
         """Return numbers of groups (g, c m, ...) as those of readings (n, m, ...)."""
@@ -83,9 +83,9 @@ class Groups:
         if self._plain:
             return each.reshape(g * c, *each.shape[2:])
         known = self.member < self.label.size
-        found = np.empty((self.label.size, *each.shape[2:]))
-        found[self.member[known]] = each[known]
-        return found
+        rows = np.empty((self.label.size, *each.shape[2:]))
+        rows[self.member[known]] = each[known]
+        return rows
 
 
 class Layout:
@@ -110,11 +110,11 @@ class Layout:
         if len(self.groups.member) <= step:
             self._known = self._known or [self.at(self.groups.first)]
             return _summed(self._known[0], products(self.groups.each(a), self.groups.each(b)), total)
-        found = np.zeros(total)
+        sums = np.zeros(total)
         for start in range(0, len(self.groups.member), step):
             part = replace(self.groups, member=self.groups.member[start : start + step])
-            found += _summed(self.at(part.first), products(part.each(a), part.each(b)), total)
-        return found
+            sums += _summed(self.at(part.first), products(part.each(a), part.each(b)), total)
+        return sums
 
 
 def products(a: Array, b: Array) -> Array:
@@ -137,14 +137,14 @@ def _summed(index: Index, values: Array, size: int) -> Array:
 
 def labels(index: Index) -> Index:
     """Return numbers (n,) that are equal where the rows of an index (n, w) are."""
-    found, highest = np.zeros(len(index), dtype=np.intp), 1
+    label, highest = np.zeros(len(index), dtype=np.intp), 1
     if not index.size or (index == index[0]).all():
-        return found
+        return label
     for column in index.T:
         size = int(column.max(initial=0)) + 1
         if highest * size > _LARGEST:
-            found = np.asarray(np.unique(found, return_inverse=True)[1], dtype=np.intp).reshape(-1)
-            highest = int(found.max(initial=0)) + 1
-        found = found * size + column
+            label = np.asarray(np.unique(label, return_inverse=True)[1], dtype=np.intp).reshape(-1)
+            highest = int(label.max(initial=0)) + 1
+        label = label * size + column
         highest *= size
-    return found
+    return label

@@ -84,17 +84,17 @@ class Normal:
         s = self._inverses.shape[1] // p if p else 1
         parts = self._inverses.reshape(-1, s, p, s, p)
         block, to = i // s, j // s
-        found = parts[block, i % s, :, j % s]
+        covariance = parts[block, i % s, :, j % s]
         if self._back.any():
             beside = self._beside.reshape(-1, s, p, s, p)
             for k, sign in ((np.flatnonzero(to == block + 1), 1), (np.flatnonzero(to == block - 1), -1)):
                 low, inside, outside = (block, i, j) if sign > 0 else (to, j, i)
                 one = beside[low[k], inside[k] % s, :, outside[k] % s]
-                found[k] = one if sign > 0 else np.swapaxes(one, 1, 2)
-            found[np.abs(to - block) > 1] = np.nan
+                covariance[k] = one if sign > 0 else np.swapaxes(one, 1, 2)
+            covariance[np.abs(to - block) > 1] = np.nan
         else:
-            found[to != block] = 0.0
-        return np.asarray(found)
+            covariance[to != block] = 0.0
+        return np.asarray(covariance)
 
     @property
     def covariance(self) -> Array:
@@ -261,8 +261,8 @@ def _inverted(matrices: Array, s: int, R: int) -> Array:
     bad = np.flatnonzero(smallest.min(axis=1, initial=1.0) <= SINGULAR)
     if bad.size:
         raise _singular(bad, s, R)
-    found = np.linalg.inv(matrices)
-    return np.asarray((found + np.swapaxes(found, 1, 2)) / 2)
+    inverse = np.linalg.inv(matrices)
+    return np.asarray((inverse + np.swapaxes(inverse, 1, 2)) / 2)
 
 
 def _singular(blocks: Index, s: int, R: int) -> SingularError:
@@ -304,10 +304,10 @@ def _forward(back: Array, right: Array) -> Array:
     """Return right sides after the elimination of the blocks before each."""
     if not back.any():
         return right
-    found = right.copy()
-    for before, after, coupling in zip(found[:-1], found[1:], np.swapaxes(back, 1, 2), strict=True):
+    solution = right.copy()
+    for before, after, coupling in zip(solution[:-1], solution[1:], np.swapaxes(back, 1, 2), strict=True):
         after -= coupling @ before
-    return found
+    return solution
 
 
 def _plain_root(S: Array) -> Array | None:

@@ -152,12 +152,12 @@ class Linear:
         padded = np.concatenate([b, np.zeros((1, b.shape[1]))])
         groups = number.of_border.among(rows)
         columns = number.columns[only][groups.first]
-        found = groups.spread(groups.each(self.border[only]) @ padded[columns], m)
+        effect = groups.spread(groups.each(self.border[only]) @ padded[columns], m)
         if number.local is not None:
             groups = number.of_local.among(rows)
             its = a[number.rows[only][groups.first]].reshape(len(groups.first), self.local_matrix.shape[2], a.shape[2])
-            found = found + groups.spread(groups.each(self.local_matrix[only]) @ its, m)
-        return np.asarray(found)
+            effect = effect + groups.spread(groups.each(self.local_matrix[only]) @ its, m)
+        return np.asarray(effect)
 
     @property
     def local_matrix(self) -> Array:
@@ -199,11 +199,11 @@ class Linear:
             return None
         q = self.numbering.size
         count = len(next(iter(self.problem.gauge.values())))
-        found = np.zeros((q + 1, count))
+        gauge = np.zeros((q + 1, count))
         for name, n in zip(self.problem.unknowns._fields, self.numbering.border, strict=True):
             if n.size and name in self.problem.gauge:
-                found[n] = np.moveaxis(self.problem.gauge[name], 0, -1)
-        return found[:q]
+                gauge[n] = np.moveaxis(self.problem.gauge[name], 0, -1)
+        return gauge[:q]
 
 
 def problem_block(linear: Linear) -> Block:
@@ -252,8 +252,8 @@ def _weight(block: Block) -> Array:
     (n, 1, w, p), or (n, 1, w, 1) if they are the same for all columns.
     """
     free = block.freed if (block.freed != block.freed[:, :1]).any() else block.freed[:, :1]
-    found = free[block.index2]
-    return np.asarray(found if block.weight is None else found * block.weight[..., None], dtype=float)[:, None]
+    numbers = free[block.index2]
+    return np.asarray(numbers if block.weight is None else numbers * block.weight[..., None], dtype=float)[:, None]
 
 
 def white_of(whitener: Array, values: Array) -> Array:
@@ -278,8 +278,8 @@ def _derivatives(problem: Problem, tables: list[Table], values: list[Array], giv
             J = given[names[k]]
             known[k] = J[:, :, None, :] if J.ndim == 3 else J
     wanted = [k for k in needed if k not in known]
-    found = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted, weighed=False)
-    by_number = {**known, **dict(zip(wanted, found, strict=True))}
+    derivatives = by_rows(lambda each: problem.evaluate(problem.y, each), tables, values, wanted, weighed=False)
+    by_number = {**known, **dict(zip(wanted, derivatives, strict=True))}
     return [by_number[k] for k in needed]
 
 

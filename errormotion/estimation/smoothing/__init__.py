@@ -238,10 +238,10 @@ def smooth_vectors(
     for k in np.unique(pattern):
         some = np.flatnonzero(pattern == k)
         values_, variance = (np.moveaxis(array[..., some], -1, 0) for array in (y, v))
-        found = smooth(
+        smoothed = smooth(
             positions, values_, variance, at, exact_zero=exact_zero, together=True, sets=some.size, order=order
         )
-        each |= {int(component): (found, i) for i, component in enumerate(some)}
+        each |= {int(component): (smoothed, i) for i, component in enumerate(some)}
     arrays: dict[str, Any] = {
         name: np.stack([getattr(one, name)[i] for one, i in (each[k] for k in range(d))], axis=y.ndim - 2)
         for name in Smooth.__dataclass_fields__
