@@ -12,6 +12,8 @@ from errormotion.plugins import FigureOfMerit, Method
 from errormotion.report import write_report
 from errormotion.report.document import Cell, Figure, Source
 from errormotion.report.elements import (
+    Across,
+    AgainstLimits,
     Chapter,
     Column,
     Curves,
@@ -379,3 +381,104 @@ def test_the_span_has_the_decimals_of_its_uncertainty():
 def test_a_table_without_rows_says_what_is_missing(over):
     with pytest.raises(ValueError, match="table 'Sizes': expected the dims of its rows"):
         Table("Sizes", (Column("noise"),), over)
+
+
+@pytest.mark.usefixtures("foreign")
+def test_parts_on_several_datasets_are_repeated_with_their_own_titles_and_identifiers():
+    def halves(errors):
+        return [errors.isel(angle=part).assign_attrs(half=name) for name, part in
+                (("first", slice(0, 12)), ("second", slice(12, 24)))]  # fmt: skip
+
+    section = Section("half-{half}", "The {half} half", (Curves("The {half} half.", ("EX",)),))
+    made = Chapter("Halves", (On(halves, (section,)), On(lambda errors: None, (section,)))).made(Source(over_angles()))
+    assert [(each.name, each.title) for each in made.sections] == [
+        ("half-first", "The first half"),
+        ("half-second", "The second half"),
+    ]
+    first, second = (each.blocks[0] for each in made.sections)
+    assert first.caption.startswith("The first half.")
+    ids = [set(re.findall(r' id="([^"]+)"', figure.svg)) for figure in (first, second)]
+    assert ids[0]
+    assert not ids[0] & ids[1]
+
+
+def test_a_figure_at_the_head_states_the_standard_in_its_name_below(foreign):
+    foreign.figures = lambda self, errors: [
+        FigureOfMerit("E of EXX (ISO 230-2)", 2e-6, 1e-7, "m"),
+        FigureOfMerit("EXX at P1 while it moved (ISO 230-3)", 2e-6, 1e-7, "m"),
+        FigureOfMerit("R of EXX (ISO 230-2)", 2e-6, 1e-7, "m"),
+    ]
+    source = Source(over_angles())
+    made = KeyFigures().key_figures(source)
+    assert [(each.label, each.note) for each in made[:2]] == [
+        ("E of EXX", "ISO 230-2"),
+        ("EXX", "P1 while it moved (ISO 230-3)"),
+    ]
+    chosen = KeyFigures(lambda errors: [f"{errors.attrs['method'][:0]}R of *"]).key_figures(source)
+    assert [each.label for each in chosen] == ["R of EXX"]
+
+
+def test_figures_against_their_limits_are_shares_with_their_uncertainty(foreign):
+    foreign.limit = 40e-6
+    (figure,) = AgainstLimits().blocks(Source(over_angles()), "k")
+    assert figure.alt == "EX0C 50 %."  # 20 um of 40 um; EA0C has no limit
+    foreign.limit = None
+    assert AgainstLimits().blocks(Source(over_angles()), "k") == []
+    (figure,) = AgainstLimits().blocks(Source(over_angles(), limits={"EA0C": (-8e-6, 8e-6)}), "k")
+    assert figure.alt == "EA0C 50 %."  # 4 urad of 8 urad
+
+
+def test_a_table_across_has_a_column_for_each_place_and_a_row_for_each_run():
+    values = 1e-6 * np.arange(33.0).reshape(3, 11)
+    values[1, 4] = np.nan
+    ds = xr.Dataset(
+        {
+            "reading": (("run", "target"), values, {"units": "m"}),
+            "place": ("target", 0.1 * np.arange(11), {"units": "m"}),
+        },
+        attrs={"axis": "X"},
+    )
+    rows = (
+        Column("place", head="position", unit="mm", format=".1", signed=False),
+        Column("reading", head="run {}"),
+        Column("absent"),
+    )
+    first, second = Across("{axis} by target.", rows, "target", decimals=lambda ds: 2).blocks(Source(ds), "k")
+    assert (first.caption, first.head, second.head[1:]) == (
+        *("X by target.", ["", *map(str, range(1, 7))], [str(k) for k in range(7, 12)]),
+    )
+    assert [row[0] for row in first.rows] == ["position / mm", "run 1", "run 2", "run 3"]
+    assert [cell.text for cell in second.rows[0][1:]] == ["600.0", "700.0", "800.0", "900.0", "1000.0"]
+    assert first.rows[2][1:] == ["11.00", "12.00", "13.00", "14.00", "—", "16.00"]
+
+
+def test_an_optional_column_is_left_out_and_another_is_dashes():
+    ds = xr.Dataset({"known": ("place", [1e-6], {"units": "m"})})
+    columns = (
+        Column("known"),
+        Column("absent"),
+        Column("absent", optional=True),
+        Column(lambda ds: None, optional=True),
+    )
+    (table,) = Table("Values.", columns, over="place").blocks(Source(ds), "k")
+    assert table.head == ["place", "known / µm", "absent"]
+    assert Table("Values.", columns[2:], over="place").blocks(Source(ds), "k") == []
+
+
+def test_curves_along_a_dim_without_scale_are_drawn_over_their_own_places():
+    places = np.array([[0.0, 0.1, 0.3], [0.0, 0.2, 0.6]])
+    ds = xr.Dataset(
+        {
+            "height": (("line", "stop"), 1e-6 * np.array([[1.0, 2, 3], [4, 5, 6]]), {"units": "m"}),
+            "distance": (("line", "stop"), places, {"units": "m"}),
+        },
+        {"line": ["PP0", "NP0"]},
+    )
+    (figure,) = Curves("Lines.", ("height",), over="stop", band=False, at="distance").blocks(Source(ds), "k")
+    assert "distance / mm" in figure.svg
+    assert "stop number" not in figure.svg
+    first, second = (
+        re.search(rf'data-name="{name}"[^>]*>.*?<path d="([^"]+)"', figure.svg, re.DOTALL) for name in ("PP0", "NP0")
+    )
+    x = [[float(v) for v in re.findall(r"[ML] ([\d.]+) ", found[1])] for found in (first, second)]
+    assert x[1][1] - x[1][0] == pytest.approx(2 * (x[0][1] - x[0][0]), abs=0.03)

@@ -53,6 +53,14 @@ def test_every_fixed_text_of_the_page_is_in_the_catalogue():
     assert not t.missing
 
 
+def test_the_head_of_a_column_is_translated_without_its_unit():
+    t = Catalogue("de", [{"excess": "Überhöhung", "excess / %": "Überhöhung in %"}])
+    assert t("excess / µm") == "Überhöhung / µm"
+    assert t("excess / %") == "Überhöhung in %"
+    assert t("surplus / µm") == "surplus / µm"
+    assert list(t.missing) == ["surplus / µm"]
+
+
 def test_a_spindle_report_is_completely_german(german, make_drift):
     drift = make_drift(300).assign_attrs(reference="mean of the record from 4.000 s to 8.000 s")
     html, missing = german(drift, tolerances={"freedoms": LIMITS}, operator="Test")

@@ -4,9 +4,11 @@ Field units, intervals, reasons of missing values, translation, and the tables a
 method draws by hand only what is its own, and adds it by `Own`.
 """
 
+from errormotion.report.elements.across import Across
 from errormotion.report.elements.chapter import Chapter, Element, On, Own, Section, Sentence
 from errormotion.report.elements.drawings import Curves, Map, PolarPlot
 from errormotion.report.elements.figures import FigureBudget, FigureTable, KeyFigures
+from errormotion.report.elements.limits import AgainstLimits
 from errormotion.report.elements.quantities import Of
 from errormotion.report.elements.standard import (
     PROVENANCE,
@@ -23,6 +25,8 @@ from errormotion.report.elements.tables import Column, Table
 __all__ = [
     "PROVENANCE",
     "UNCERTAINTY",
+    "Across",
+    "AgainstLimits",
     "Budget",
     "Chapter",
     "Column",

@@ -113,24 +113,39 @@ class Own:
 class On:
     """Parts that read another dataset than the whole one: a selection, or one with further variables and attributes.
 
-    ``choose`` returns it; None where the parts do not apply, which leaves them out.
+    ``choose`` returns it, or several, for each of which the parts are repeated; None where the parts do not apply,
+    which leaves them out. In a chapter the parts are sections.
     """
 
-    choose: Callable[[xr.Dataset], xr.Dataset | None]
-    parts: Sequence[Element]
+    choose: Callable[[xr.Dataset], xr.Dataset | Sequence[xr.Dataset] | None]
+    parts: Sequence[Element | Section]
 
     def blocks(self, source: Source, key: str) -> list[Block]:
-        """Return the blocks of the parts for the chosen dataset."""
-        chosen_part = self.choose(source.errors)
-        if chosen_part is None:
-            return []
-        part = replace(source, errors=chosen_part)
-        return [block for k, each in enumerate(self.parts) for block in each.blocks(part, f"{key}-{k}")]
+        """Return the blocks of the parts for each chosen dataset."""
+        parts = [each for each in self.parts if not isinstance(each, Section)]
+        return [block for each, own in self._each(source, key) for k, part in enumerate(parts)
+                for block in part.blocks(each, f"{own}-{k}")]  # fmt: skip
+
+    def sections(self, source: Source, key: str) -> list[document.Section]:
+        """Return the sections for each chosen dataset."""
+        sections = [each for each in self.parts if isinstance(each, Section)]
+        made = [section.made(each, own) for each, own in self._each(source, key) for section in sections]
+        return [section for section in made if section is not None]
+
+    def _each(self, source: Source, key: str) -> list[tuple[Source, str]]:
+        """Return the source of each chosen dataset, and its key."""
+        found = self.choose(source.errors)
+        if found is None or isinstance(found, xr.Dataset):
+            return [] if found is None else [(replace(source, errors=found), key)]
+        return [(replace(source, errors=each), f"{key}-{k}") for k, each in enumerate(found)]
 
 
 @dataclass(frozen=True)
 class Section:
-    """A titled sequence of parts, left out if none of them has anything to show; ``name`` is its anchor in the page."""
+    """A titled sequence of parts, left out if none of them has anything to show.
+
+    ``name`` is its anchor in the page; `{name}` in it and in the title is replaced by an attribute of the dataset.
+    """
 
     name: str
     title: str
@@ -138,8 +153,9 @@ class Section:
 
     def made(self, source: Source, key: str) -> document.Section | None:
         """Return the section for a dataset; None without blocks."""
-        blocks = [block for k, each in enumerate(self.parts) for block in each.blocks(source, f"{key}-{self.name}-{k}")]
-        return document.Section(self.name, self.title, blocks) if blocks else None
+        name, title = (filled(text, source.errors) for text in (self.name, self.title))
+        blocks = [block for k, each in enumerate(self.parts) for block in each.blocks(source, f"{key}-{name}-{k}")]
+        return document.Section(name, title, blocks) if blocks else None
 
 
 @dataclass(frozen=True)
@@ -151,26 +167,28 @@ class Chapter:
     title : str
         `{name}` is replaced by an attribute of the dataset.
     parts : sequence
-        In their order: key figures, sentences of the summary, and sections.
+        In their order: key figures, sentences of the summary, sections, and sections `On` a selection.
     kind : str
         Title line of a report that starts with this chapter.
     """
 
     title: str
-    parts: Sequence[KeyFigures | Sentence | Section | Callable[[Source], Sequence[str]]]
+    parts: Sequence[KeyFigures | Sentence | Section | On | Callable[[Source], Sequence[str]]]
     kind: str = "Test report"
 
     def made(self, source: Source, key: str = "") -> Part:
         """Return the chapter of a dataset; ``key`` distinguishes its drawings, by default the key of the source."""
         keys, words, sections = list[document.KeyFigure](), list[str](), list[document.Section]()
-        later: list[str] = []
-        for each in self.parts:
+        later, key = list[str](), key or source.key
+        for k, each in enumerate(self.parts):
             if isinstance(each, KeyFigures):
                 keys += each.key_figures(source)
                 later += each.sentences(source)
             elif isinstance(each, Section):
-                section = each.made(source, key or source.key)
+                section = each.made(source, key)
                 sections += [section] if section is not None else []
+            elif isinstance(each, On):
+                sections += each.sections(source, f"{key}-{k}")
             elif isinstance(each, Sentence):
                 words += [text] if (text := each.text(source)) else []
             else:

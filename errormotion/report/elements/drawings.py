@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.places import Scale, scale_of
+from errormotion.datasets.results.places import Scale, in_field_units, scale_of
 from errormotion.report import canvas
 from errormotion.report.document import Block, Figure, Source, Text
 from errormotion.report.drawings import maps
@@ -54,6 +54,7 @@ class Curves:
         is drawn as the curve; the values are then points.
     at : str
         A variable over the dims of the quantities with the exact place of each point, in the SI unit of the abscissa.
+        If the dim has no scale, it is the abscissa.
     absent : str
         A note in place of the drawing if nothing is known.
     """
@@ -86,10 +87,10 @@ class Curves:
         known = _known(flat, along, others)
         picks = panels.evenly(np.flatnonzero(known).tolist(), self.most)
         scale, order = panels.sorted_along(ds, along)
+        own, scale = _exact(ds, self.at, along, others, order, scale)
         looks = panels.looks(ds, others, len(picks))
         smooth = _smoothed(ds, self.smooth, others)
         columns = self.columns or (1 if len(found) == 1 else 2)
-        own = _exact(ds, self.at, along, others, order, scale)
 
         def paint(axes: Axes, panel: list[Quantity]) -> None:
             unit = panel[0].unit
@@ -110,7 +111,8 @@ class Curves:
                     if smooth is not None and (curve := smooth(each, pick)) is not None:
                         canvas.curve(axes, *curve, colour=colour, dash=dash, name=name)
                     elif scale.joined and scale.values.size > 1:
-                        canvas.curve(axes, scale.values, values[pick], band, colour=colour, dash=dash, name=name)
+                        x = scale.values if own is None else own[pick]
+                        canvas.curve(axes, x, values[pick], band, colour=colour, dash=dash, name=name)
                         continue
                     panels.points(axes, scale.values if own is None else own[pick], values[pick], band, colour)
             _ticks(axes, scale)
@@ -397,14 +399,19 @@ def _curves(
 
 def _exact(
     ds: xr.Dataset, name: str, along: str, others: Sequence[str], order: np.ndarray, scale: Scale
-) -> np.ndarray | None:
-    """Return the exact places of the points, (curve, place), in the unit of the abscissa; None without the variable."""
+) -> tuple[np.ndarray | None, Scale]:
+    """Return the exact places of the points, (curve, place), in the unit of the abscissa, and the scale.
+
+    The places are None without the variable. It is the scale of a dim that has none.
+    """
     if name not in ds or set(ds[name].dims) != {along, *others}:
-        return None
-    unit = scale.label.rpartition(" / ")[2]
-    stated = _curves(ds[name], UNITS.get(unit, ("", 1.0))[1], along, others, order)
-    assert stated is not None
-    return np.where(np.isfinite(stated), stated, scale.values)
+        return None, scale
+    unit = scale.label.rpartition(" / ")[2] if scale.joined or scale.texts else in_field_units(ds[name])[1]
+    places = _curves(ds[name], UNITS.get(unit, ("", 1.0))[1], along, others, order)
+    assert places is not None
+    if scale.joined or scale.texts:
+        return np.where(np.isfinite(places), places, scale.values), scale
+    return places, Scale(places.mean(axis=0), f"{name} / {unit}", [], joined=True)
 
 
 def _ticks(axes: Axes, scale: Scale) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import xarray as xr
 from markupsafe import escape
 
 from errormotion.datasets.results.effects import effects_of, influence_of
@@ -24,6 +26,10 @@ LARGE_OF_LIMIT = 1.0 / 3.0
 LARGE_OF_VALUE = 0.5
 """U divided by the value from which on it does so without a limit."""
 INDEPENDENT = "independent"
+Names = Sequence[str] | Callable[[xr.Dataset], Sequence[str]]
+"""Names of figures of merit, in which ``*`` stands for any characters, or a function of the dataset."""
+_PLACE = re.compile(r" at (.*)| \((.*)\)$")
+"""What follows the name of a figure at the head: its place, or the standard that defines it."""
 _MOST = 8
 """Key figures; the table contains all."""
 _NAMED = 3
@@ -36,18 +42,19 @@ class KeyFigures:
 
     Attributes
     ----------
-    names : sequence of str
-        Names of figures of merit, in this order; ``*`` stands for any characters. By default all. A result without
-        figures of merit states its largest errors.
+    names : sequence of str or callable
+        Names of figures of merit, in this order; ``*`` stands for any characters; or a function of the dataset that
+        returns them. By default all. A result without figures of merit states its largest errors.
     units : mapping of str to str
         Unit on the page by the SI unit, keys of `quantities.UNITS`; by default um and arcsec.
     note : str
-        Below each figure that has no limit; by default the place in its name, which follows " at ".
+        Below each figure that has no limit; by default the place in its name, which follows " at ", or the standard
+        in parentheses at its end.
     signed : bool
         Whether a positive value has a plus sign.
     """
 
-    names: Sequence[str] = ()
+    names: Names = ()
     units: Mapping[str, str] | None = None
     note: str = ""
     signed: bool = False
@@ -59,8 +66,8 @@ class KeyFigures:
         for each in stated[:_MOST] or largest(source):
             unit, size = unit_of(each.unit, (self.units or {}).get(each.unit, ""))
             limit = limit_of(source, each)
-            name, _, place = each.name.partition(" at ")
-            note = self.note or place if stated else "largest"
+            name, *place = _PLACE.split(each.name, 1)
+            note = self.note or "".join(filter(None, place)) if stated else "largest"
             if math.isfinite(limit):
                 note = f"limit {_with(significant(limit / size, 3), unit)}"
             cell = estimate(each.value / size, each.expanded_uncertainty / size, signed=self.signed or not stated)
@@ -82,7 +89,7 @@ class FigureTable:
     Attributes
     ----------
     caption : str
-    names : sequence of str
+    names : sequence of str or callable
         As in `KeyFigures`.
     units : mapping of str to str
         As in `KeyFigures`.
@@ -91,7 +98,7 @@ class FigureTable:
     """
 
     caption: str = "Figures of merit. After ±: expanded uncertainty, k = 2."
-    names: Sequence[str] = ()
+    names: Names = ()
     units: Mapping[str, str] | None = None
     meanings: Mapping[str, str] | None = None
 
@@ -119,14 +126,14 @@ class FigureBudget:
 
     Attributes
     ----------
-    names : sequence of str
+    names : sequence of str or callable
         As in `KeyFigures`; figures without known effects of the sources are left out.
     caption : str
     units : mapping of str to str
         As in `KeyFigures`.
     """
 
-    names: Sequence[str] = ()
+    names: Names = ()
     caption: str = "Uncertainty budget: standard uncertainty (k = 1) of the figures, by group of sources."
     units: Mapping[str, str] | None = None
 
@@ -156,11 +163,12 @@ class FigureBudget:
         return [document.Table(filled(self.caption, source.errors), ["source", *names], rows)]
 
 
-def chosen(source: Source, names: Sequence[str]) -> list[FigureOfMerit]:
+def chosen(source: Source, names: Names) -> list[FigureOfMerit]:
     """Return the figures of merit that the method states, with these names in their order; all without names."""
     figures = list(source.merit[0]) if states_figures(source.errors) else []
     if not names:
         return figures
+    names = names(source.errors) if callable(names) else names
     return [each for name in names for each in figures if matches(name, each.name)]
 
 

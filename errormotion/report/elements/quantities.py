@@ -34,8 +34,8 @@ UNITS: dict[str, tuple[str, float]] = {
 FIELD = {"m": "um", "rad": "arcsec"}
 """Unit of a quantity on the page by its SI unit, if the part states none."""
 
-Own = Callable[[xr.Dataset], xr.DataArray]
-"""A quantity that is computed from the dataset."""
+Own = Callable[[xr.Dataset], xr.DataArray | None]
+"""A quantity that is computed from the dataset; None if it is not part of it."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Of:
     Attributes
     ----------
     variable : str or callable
-        A freedom (``EX``, ``deviation``), a variable, or a function of the dataset that returns a `DataArray`.
+        A freedom (``EX``, ``deviation``), a variable, or a function of the dataset that returns a `DataArray`, or None.
     uncertainty : str or callable
         Variable of the standard uncertainties, or of a covariance whose last dim has the suffix ``_``. By default that
         of the errors for a freedom, else the variable of the same name with ``_u``, ``_uncertainty`` or

@@ -55,6 +55,8 @@ class Column(Of):
         Why a value is unknown: the footnote of its dash, or the name of a variable of texts over the rows.
     reduce : str
         How the values at one row become one number: a key of `REDUCTIONS`. The uncertainty is left out.
+    optional : bool
+        Whether the column is left out if the dataset lacks its variable, in place of dashes.
     """
 
     head: str = ""
@@ -62,6 +64,7 @@ class Column(Of):
     signed: bool = True
     reason: str = "not determined"
     reduce: str = ""
+    optional: bool = False
 
     def title(self, quantity: Quantity | None) -> str:
         """Return the head of the column."""
@@ -148,7 +151,9 @@ class Table:
         if ds is None:
             return [Text(self.absent, "note")] if self.absent else []
         over = [self.over] if isinstance(self.over, str) else list(self.over)
-        found = [column.read(ds) for column in self.columns]
+        read = [(column, column.read(ds)) for column in self.columns]
+        read = [(column, each) for column, each in read if each is not None or not column.optional]
+        columns, found = [column for column, _ in read], [each for _, each in read]
         if not any(found) or not set(over) <= set(map(str, ds.sizes)):
             return [Text(self.absent, "note")] if self.absent else []
         place = self.place or _name_of
@@ -156,7 +161,7 @@ class Table:
         shown = np.ones(shape, bool)
         if self.where is not None:
             shown = np.asarray(self.where(ds).transpose(*over).values, dtype=bool)
-        made = [_column(ds, column, each, over, shape) for column, each in zip(self.columns, found, strict=True)]
+        made = [_column(ds, column, each, over, shape) for column, each in zip(columns, found, strict=True)]
         rows: list[list[Cell | str]] = []
         indices = np.argwhere(shown)
         if not len(indices):
@@ -169,7 +174,7 @@ class Table:
             own = slice(1, None) if len(over) > 1 else slice(None)
             name = place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
             rows.append([name, *_once([column[tuple(index)] for column in made])])
-        heads = [column.title(each) for column, each in zip(self.columns, found, strict=True)]
+        heads = [column.title(each) for column, each in zip(columns, found, strict=True)]
         more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
         notes = [note for each in self.notes for note in (each(ds) if callable(each) else [each])]
         head = [self.head or over[-1], *heads]

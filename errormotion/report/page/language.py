@@ -129,6 +129,9 @@ class Catalogue:
             return self._exact[plain]
         if not _LETTERS.search(_UNITS.sub("", plain)):
             return self._with_units(text, _NUMBER)  # a symbol, numbers, a unit
+        name, slash, unit = plain.rpartition(" / ")
+        if slash and name in self._exact:  # the head of a column
+            return f"{self._exact[name]} / {self.word(unit)}"
         for pattern, made in self._patterns:
             match = pattern.fullmatch(plain)
             if match is not None:

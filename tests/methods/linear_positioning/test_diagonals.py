@@ -177,7 +177,7 @@ def test_the_report_shows_figures_squareness_and_a_graph_of_each_diagonal():
     (part,) = chapters(Source(errors, raw=raw, key="test"))
     titles = [section.title for section in part.sections]
     assert titles[:3] == ["Figures of ISO 230-6", "Squareness", "Diagonal PP0"]
-    assert [figure.label for figure in part.key_figures][-1] == "squareness EC0Y"
+    assert [figure.label for figure in part.key_figures][-1] == "squareness EC0Y by diagonals"
 
 
 # ---------------------------------------------------------------------- measuring

@@ -1,9 +1,9 @@
-"""Report chapter: positioning of a linear axis after ISO 230-2."""
+"""Report chapters: positioning of a linear axis after ISO 230-2, diagonals, a moving axis."""
 
 from __future__ import annotations
 
 from errormotion.datasets.results.merit import is_planned
-from errormotion.methods.linear_positioning.report import chapter, diagonals, moving
+from errormotion.methods.linear_positioning.report import axis, diagonals, moving
 from errormotion.report.document import Part, Source
 from errormotion.report.page.language import texts_of
 
@@ -12,11 +12,9 @@ def chapters(source: Source) -> list[Part]:
     """Return the chapter of a result; none for a plan, which has no readings."""
     if is_planned(source.errors):
         return []
-    if "distortion" in source.errors:
-        return [moving.part(source, source.key)]
-    if "squareness" in source.errors:
-        return [diagonals.part(source, source.key)]
-    return [chapter.part(source, source.key)]
+    kinds = {"distortion": moving.CHAPTER, "squareness": diagonals.CHAPTER}
+    chapter = next((kinds[name] for name in kinds if name in source.errors), axis.CHAPTER)
+    return [chapter.made(source)]
 
 
 def texts(language: str) -> dict[str, str]:

@@ -75,9 +75,9 @@ def _curve(name: str, variable: str, extreme: str = "", word: str = "") -> Calla
 
 
 def _plot(name: str) -> Panel:
-    mean = Of(_curve(name, "synchronous"), uncertainty=_curve(name, "synchronous_u"))  # type: ignore[arg-type]
-    outer = Of(_curve(name, "synchronous", "asynchronous_high", "max"), uncertainty="none")  # type: ignore[arg-type]
-    inner = Of(_curve(name, "synchronous", "asynchronous_low", "min"), uncertainty="none")  # type: ignore[arg-type]
+    mean = Of(_curve(name, "synchronous"), uncertainty=_curve(name, "synchronous_u"))
+    outer = Of(_curve(name, "synchronous", "asynchronous_high", "max"), uncertainty="none")
+    inner = Of(_curve(name, "synchronous", "asynchronous_low", "min"), uncertainty="none")
     return (mean, outer, inner)
 
 
