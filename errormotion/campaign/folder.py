@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -40,11 +40,15 @@ Status = Literal["running", "finished", "interrupted", "failed"]
 
 def new_entries(bench: BenchPlan) -> dict[str, Any]:
     """Return the entries of ``run.json`` of a new measurement with a bench."""
+    of_bench = {"name": bench.name, "machine": bench.machine, "file": bench.source.name, "text": bench.text}
+    return {"acquired": False, "bench": of_bench, **first_entries()}
+
+
+def first_entries() -> dict[str, Any]:
+    """Return the entries of ``run.json`` of a new run that depend on no bench."""
     return {
         "status": "running",
         "reason": "",
-        "acquired": False,
-        "bench": {"name": bench.name, "machine": bench.machine, "file": bench.source.name, "text": bench.text},
         "software": make({}, None, None)["software"],
         "samples": {},
         "raw": "raw.zarr",
@@ -127,8 +131,18 @@ class RunFolder:
         self._is_locked = False
 
     @classmethod
-    def create(cls, runs: Path, test: str, run_id: str, data: dict[str, Any]) -> Self:
+    def create(
+        cls,
+        runs: Path,
+        test: str,
+        run_id: str,
+        data: dict[str, Any],
+        fill: Callable[[Path], Mapping[str, Any]] | None = None,
+    ) -> Self:
         """Create a folder with its ``run.json``, by a rename.
+
+        ``fill(folder)`` writes further files into the folder before the rename, and returns further entries of
+        ``run.json``, which replace others. If it raises an error, there is no folder.
 
         Raises
         ------
@@ -142,7 +156,8 @@ class RunFolder:
         try:
             make_folder(runs)
             with whole_folder(path) as part:
-                folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data})
+                further = fill(part) if fill is not None else {}
+                folder = cls(part, {"schema": SCHEMA, "id": run_id, "test": test, "created": now(), **data, **further})
                 folder.save()
         except OSError as error:
             raise RunError(

@@ -42,6 +42,7 @@ from errormotion.datasets.results.merit import figures_of, stored
 from errormotion.datasets.timing import later
 from errormotion.datasets.validation import explained
 from errormotion.errors import ErrormotionError, RunError, code_of
+from errormotion.plugins import Method
 from errormotion.report.page import logo
 from errormotion.tolerances.conformity import judge
 from errormotion.tolerances.table import from_run
@@ -452,20 +453,7 @@ class _Session:
 
     def _identify(self, folder: RunFolder, test: TestPlan) -> None:
         self.progress.stage("identifying")
-        method = test.method()
-        path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
-        file = folder.inside(path)
-        if file.exists():  # computed, but the process ended before run.json was written
-            errors = datasets.load(file)
-        else:
-            with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
-                errors = noted(method.identify(raw, test.settings), raw)
-            datasets.validate(errors)
-            file.parent.mkdir(parents=True, exist_ok=True)
-            datasets.save(errors, file)
-        folder.step("identify", "done")
-        folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
-        log.info("identified", extra={"data": {"errors": path}})
+        identify_run(folder, test.method(), test.settings)
 
     def _evaluate(self, folder: RunFolder, test: TestPlan) -> None:
         """Evaluate the result by the Monte Carlo method; a failure is only logged, as for the report."""
@@ -487,18 +475,38 @@ class _Session:
             folder.step("monte_carlo", "done")
 
     def _report(self, folder: RunFolder) -> None:
-        """Write the report; a failure is only logged, since the measurement is valid without it."""
-        if self.report is None:
-            return
-        self.progress.stage("writing the report")
-        try:
-            path = self.report(folder.path)
-        except Exception as error:
-            log.exception("the report failed")
-            folder.step("report", "failed", reason=cause_of(error))
-        else:
-            folder.step("report", "done")
-            folder.data["report"] = path.relative_to(folder.path).as_posix()
+        if self.report is not None:
+            self.progress.stage("writing the report")
+            report_run(folder, self.report)
+
+
+def identify_run(folder: RunFolder, method: Method, settings: Any) -> None:
+    """Identify the raw data of a run into its folder, and state the result in its ``run.json``."""
+    path = f"errors/{method.info.id}-{folder.data['settings_hash']}/errors.nc"
+    file = folder.inside(path)
+    if file.exists():  # computed, but the process ended before run.json was written
+        errors = datasets.load(file)
+    else:
+        with datasets.load(folder.raw) as raw, explained(folder.raw, raw):
+            errors = noted(method.identify(raw, settings), raw)
+        datasets.validate(errors)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        datasets.save(errors, file)
+    folder.step("identify", "done")
+    folder.save(errors=path, results=results_of(errors), conformity=conformity_of(folder, errors))
+    log.info("identified", extra={"data": {"errors": path}})
+
+
+def report_run(folder: RunFolder, report: Callable[[Path], Path]) -> None:
+    """Write the report of a run; a failure is only logged, since the measurement is valid without it."""
+    try:
+        path = report(folder.path)
+    except Exception as error:
+        log.exception("the report failed")
+        folder.step("report", "failed", reason=cause_of(error))
+    else:
+        folder.step("report", "done")
+        folder.data["report"] = path.relative_to(folder.path).as_posix()
 
 
 class _Chunks:

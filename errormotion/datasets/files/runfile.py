@@ -67,6 +67,15 @@ class _Samples(_Table):
     invalid: dict[str, int] = {}
 
 
+class _File(_Table):
+    name: str
+    sha256: str
+
+
+class _Imported(_Table):
+    files: list[_File] = []
+
+
 class _Run(_Table):
     id: str = ""
     test: str = ""
@@ -90,6 +99,8 @@ class _Run(_Table):
     tolerances: dict[str, Any] | None = None
     conformity: dict[str, Any] | None = None
     head: dict[str, Any] | None = None
+    imported: _Imported | None = None
+    start: str = ""
 
 
 class State(dict[str, Any]):

@@ -24,6 +24,8 @@ MAX_TEXT = 200
 """Longest text, characters."""
 MAX_FIGURES = 200
 """Largest number of figures of merit of a run."""
+MAX_FILES = 50
+"""Largest number of files of an imported run."""
 _SPACES = re.compile(r"[ \t\r\n]*")
 
 
@@ -36,7 +38,7 @@ class Entry:
     folder : str
         Name of the run folder.
     created : str
-        ISO 8601; empty if unknown.
+        ISO 8601; empty if unknown. For an imported run the start of the measurement, if it is known.
     machine, test, method, campaign, status : str
         Empty if unknown.
     errors : str
@@ -51,6 +53,8 @@ class Entry:
         A sentence for each note that cannot be read.
     partial : str
         A sentence on what was not read because ``run.json`` is too large; empty if it was read completely.
+    imported : tuple of str
+        SHA-256 of each file of an imported run; empty for a measured one.
     """
 
     folder: str
@@ -66,10 +70,16 @@ class Entry:
     notes: tuple[Event, ...] = ()
     damaged_notes: tuple[str, ...] = ()
     partial: str = ""
+    imported: tuple[str, ...] = ()
+
+    @property
+    def state(self) -> str:
+        """Status with the mark of an imported run."""
+        return f"{self.status}, imported" if self.imported else self.status
 
     @property
     def time(self) -> datetime | None:
-        """Creation of the run; None if unknown."""
+        """Creation of the run, of an imported one the start of the measurement; None if unknown."""
         return events.instant(self.created)
 
     @property
@@ -121,7 +131,7 @@ def read_entry(folder: Path) -> Entry:
         raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}", code="run.file.schema")
     return Entry(
         folder.name,
-        _text(data.get("created")),
+        (_text(data.get("start")) if data.get("imported") else "") or _text(data.get("created")),
         _text(data.get("bench"), "machine"),
         _text(data.get("test")),
         _text(data.get("method"), "id"),
@@ -132,6 +142,7 @@ def read_entry(folder: Path) -> Entry:
         _text(data.get("conformity"), "verdict"),
         *events.read(folder),
         partial=partial,
+        imported=_hashes(data.get("imported")),
     )
 
 
@@ -204,8 +215,12 @@ def from_plain(data: Any) -> Entry | None:
     known = tuple(each for each in read if isinstance(each, Event))
     if len(known) < len(read):
         return None
+    hashes = data.get("imported")
+    if not isinstance(hashes, list) or not all(isinstance(each, str) for each in hashes):
+        return None
     texts = {name: data[name] for name in names}
-    return Entry(**texts, figures=figures_from(data.get("figures")), notes=known, damaged_notes=tuple(damaged))
+    figures = figures_from(data.get("figures"))
+    return Entry(**texts, figures=figures, notes=known, damaged_notes=tuple(damaged), imported=tuple(hashes))
 
 
 def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
@@ -227,6 +242,17 @@ def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
             )
         )
     return tuple(found)
+
+
+def _hashes(data: Any) -> tuple[str, ...]:
+    """Return the SHA-256 of each file of an imported run; empty for a measured one."""
+    files = data.get("files") if isinstance(data, Mapping) else None
+    found = (
+        [_text(each, "sha256") for each in files[:MAX_FILES] if isinstance(each, Mapping)]
+        if isinstance(files, list)
+        else []
+    )
+    return tuple(each for each in found if each)
 
 
 def _number(value: Any) -> float:

@@ -19,7 +19,7 @@ from errormotion.datasets.files.writing import replace_text
 from errormotion.record.runs.entry import Entry, from_plain
 
 FILE = ".errormotion-index.json"
-SCHEMA = "errormotion.index/2"
+SCHEMA = "errormotion.index/3"
 MAX_SIZE = 256 << 20
 """Largest size of an index, bytes."""
 MAX_LINE = 4 << 20
