@@ -184,7 +184,7 @@ def _row(key: str, entry: Entry) -> Row:
         name, texts = entry.figures[0].name, figure_text(entry.figures[0])
         if not math.isfinite(entry.figures[0].value):
             texts = (DASH, DASH, texts[2])
-    return Row(key, started, entry.machine, entry.test, entry.method, name, *texts, entry.verdict, entry.status)
+    return Row(key, started, entry.machine, entry.test, entry.method, name, *texts, entry.verdict, entry.state)
 
 
 def _fits(entry: Entry, choice: Choice) -> bool:

@@ -16,7 +16,7 @@ from errormotion.report.text import DASH
 SIMULATED = "simulated"
 """Machine of data that a method simulates from its own model."""
 _ATTRIBUTES = ("schema", "method", "method_version", "component", "frame", "functional_point", "reference", "sign")
-_RUN = ("campaign", "bench", "inputs", "samples")
+_RUN = ("campaign", "bench", "imported", "inputs", "samples")
 _ROOT = r"(?:~[\\/]|/|[A-Za-z]:[\\/]|\\\\)"
 _WHOLE_PATH = re.compile(rf"{_ROOT}[^\\/\n]+[\\/][^\n]*$")
 _PATH = re.compile(rf"(?<![^\s'\"(=,;\[]){_ROOT}(?:[^\\/\s'\"<>|,;]+[\\/])+[^\\/\s'\"<>|,;]*")

@@ -100,7 +100,6 @@ class _Run(_Table):
     conformity: dict[str, Any] | None = None
     head: dict[str, Any] | None = None
     imported: _Imported | None = None
-    start: str = ""
 
 
 class State(dict[str, Any]):

@@ -50,7 +50,7 @@ class Statement(_Table):
         default_factory=dict, max_length=_ENTRIES, description="of the test, such as feed = '1000 mm/min'"
     )
 
-    def head(self) -> dict[str, Any]:
+    def stated(self) -> dict[str, Any]:
         """Return the head of the report for ``run.json``; what is not stated is absent."""
         until = {each.name: each.calibrated_until for each in self.instruments if each.calibrated_until is not None}
         certificates = {each.name: each.certificate for each in self.instruments if each.certificate}

@@ -131,7 +131,7 @@ def read_entry(folder: Path) -> Entry:
         raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}", code="run.file.schema")
     return Entry(
         folder.name,
-        (_text(data.get("start")) if data.get("imported") else "") or _text(data.get("created")),
+        _text(data.get("created")),
         _text(data.get("bench"), "machine"),
         _text(data.get("test")),
         _text(data.get("method"), "id"),

@@ -33,6 +33,8 @@ class Head:
         Instrument or artefact, and the last day of its calibration.
     certificates : mapping of str to str
         Instrument or artefact, and the number of its certificate.
+    environment, conditions : mapping of str to str
+        Of the test, where they are stated for imported data.
     language, paper : str
         Of the page.
     """
@@ -46,6 +48,8 @@ class Head:
     number: str = ""
     calibrated_until: Mapping[str, date] = field(default_factory=dict)
     certificates: Mapping[str, str] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+    conditions: Mapping[str, str] = field(default_factory=dict)
     language: str = ""
     paper: str = ""
 
@@ -63,8 +67,11 @@ def head_of(run: Mapping[str, Any]) -> Head:
     logo = logo if isinstance(logo, str) and logo.startswith("data:image/") and len(logo) <= MAX_LOGO else ""
     names = ("laboratory", "address", "accreditation", "customer", "order", "number", "language", "paper")
     until = {name: day for name, each in _pairs(stated, "calibrated_until") if (day := _day(each)) is not None}
-    certificates = {name: str(each) for name, each in _pairs(stated, "certificates")}
-    return Head(**{name: text(name) for name in names}, logo=logo, calibrated_until=until, certificates=certificates)
+    facts = {
+        key: {name: str(each) for name, each in _pairs(stated, key)}
+        for key in ("certificates", "environment", "conditions")
+    }
+    return Head(**{name: text(name) for name in names}, logo=logo, calibrated_until=until, **facts)
 
 
 def _pairs(stated: Mapping[str, Any], name: str) -> list[tuple[str, Any]]:
@@ -107,14 +114,33 @@ def facts(source: Source, machine: str, head: Head, report: str) -> list[tuple[s
         ("Order", head.order),
         ("Machine", machine),
         ("Test", test if test != DASH else str(attributes.get("iso_test", DASH))),
-        ("Measured", moment(measured(source))),
+        ("Measured", " ".join(filter(None, (moment(measured(source)), _unstated(source))))),
         ("Operator", _known(source, "operator")),
         *(method if "method" in attributes else []),
         ("Run", _known(source, "id", "run")),
         ("Report", report),
+        ("Imported from", ", ".join(imported(source.run))),
         ("Instruments", "; ".join(_instrument(row) for row in instruments)),
+        ("Environment", _listed(head.environment)),
+        ("Conditions of the test", _listed(head.conditions)),
     ]
     return [(name, fact) for name, fact in found if fact and fact != DASH]
+
+
+def imported(run: Mapping[str, Any]) -> list[str]:
+    """Return the names of the files of an imported run; empty for a measured one."""
+    found = run.get("imported")
+    files = found.get("files") if isinstance(found, Mapping) else None
+    return [str(each["name"]) for each in files or () if isinstance(each, Mapping) and each.get("name")]
+
+
+def _unstated(source: Source) -> str:
+    """Return where the time of an imported measurement is from, if the files do not state it."""
+    return f"({source.run['created_from']})" if source.run.get("created_from") else ""
+
+
+def _listed(facts: Mapping[str, str]) -> str:
+    return "; ".join(f"{name}: {fact}" for name, fact in facts.items())
 
 
 def _instrument(row: Mapping[str, str]) -> str:

@@ -64,7 +64,7 @@ def run(
         return
     for folder in folders:
         show(f"\n{folder.data['test']} ({folder.data['method']['id']}): {folder.data['status']} in {folder.path}")
-        for line in _lines(folder):
+        for line in result_lines(folder):
             show(f"  {line}")
     for line in remarks(decisions):
         show(line)
@@ -146,14 +146,15 @@ def report_error(folder: RunFolder) -> str | None:
     return str(reports[-1]["reason"]) if reports and reports[-1]["outcome"] == "failed" else None
 
 
-def _lines(folder: RunFolder) -> list[str]:
+def result_lines(folder: RunFolder) -> list[str]:
+    """Return the results of a run as printed: decision, files, figures and notes."""
     found = describe(folder)
     table = from_run(folder.data)
     lines = judge(datasets.load(found["errors"]), table).lines() if table is not None and found["errors"] else []
     lines += [f"report  {found['report']}"] if found["report"] else []
     if found["report_error"]:
         lines.append(f"no report: {found['report_error']}; when corrected, run: errormotion report {folder.path}")
-    lines.append(f"errors  {found['errors']}")
+    lines += [f"errors  {found['errors']}"] if found["errors"] else []
     if found["results"]:
         lines += figure_table(found["results"]).splitlines()
     samples = found["samples"] or {}

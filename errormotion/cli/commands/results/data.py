@@ -364,6 +364,7 @@ def _mistakes(message: str, file: Path) -> list[str]:
 def _of_run(path: Path) -> list[str]:
     from errormotion.campaign.folder import RunFolder
     from errormotion.datasets.files import events
+    from errormotion.record.adding import originals
 
     try:
         folder = RunFolder.open(path)
@@ -372,7 +373,7 @@ def _of_run(path: Path) -> list[str]:
     found = []
     for part in ([folder.raw] if folder.raw.exists() else []) + visible(path, "errors/*/errors.nc"):
         found += [f"{part.relative_to(path)}: {violation}" for violation in validate(part)]
-    found += events.read(path)[1]
-    if folder.finished and folder.errors is None:
+    found += [*originals.violations(folder), *events.read(path)[1]]
+    if folder.finished and folder.errors is None and folder.data.get("method", {}).get("id", "-"):
         found.append("run.json: expected 'errors', because the run is finished; found null")
     return found

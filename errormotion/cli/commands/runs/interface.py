@@ -32,6 +32,51 @@ def runs(
 
 
 @app.command()
+def add(
+    files: Annotated[list[Path], typer.Argument(help="Files of one measurement: tables, logs, datasets.")],
+    machine: Annotated[str, typer.Option(help="Name of the machine.")] = "",
+    method: Annotated[str, typer.Option(help="Id of a method plugin; default: that of the data.")] = "",
+    axis: Annotated[str, typer.Option(help="Axis that moved, such as X.")] = "",
+    map_: Annotated[Path | None, typer.Option("--map", help="A TOML file that describes the columns.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One setting, or the answer to a question; may be repeated."),
+    ] = None,
+    head: Annotated[
+        Path | None, typer.Option(help="A TOML file for the head of the report: laboratory, customer, instruments.")
+    ] = None,
+    measured: Annotated[
+        str | None, typer.Option(metavar="DATE", help="Start of the measurement, if the files do not state it.")
+    ] = None,
+    test: Annotated[str, typer.Option(help="Name of the test; default: method and axis.")] = "",
+    tolerances: options.Limits = None,
+    runs: Annotated[Path, typer.Option(help="Folder for run folders.")] = Path("runs"),
+    yes: Annotated[bool, typer.Option("--yes", help="Take the proposed answers to all questions.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Add files once more that are in the record.")] = False,
+    json_: options.Json = False,
+) -> None:
+    """Add files of other software to the record: import, identify and report them."""
+    from errormotion.cli.commands.runs import add as command
+    from errormotion.record.adding.add import Request
+
+    start = options.date("--measured", measured)
+    request = Request(
+        tuple(files),
+        runs,
+        machine=machine,
+        method=method,
+        axis=axis,
+        measured=start.isoformat() if start is not None else "",
+        test=test,
+        map=map_,
+        head=head,
+        tolerances=tolerances,
+        again=again,
+    )
+    command.add(request, set_ or [], yes, json_)
+
+
+@app.command()
 def truth(
     run: Annotated[Path, typer.Argument(help="Run folder of a campaign with a [timeline] on a virtual machine.")],
     out: Annotated[Path, typer.Option(help="File of the error dataset (.nc).")],

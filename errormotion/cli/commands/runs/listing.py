@@ -95,7 +95,7 @@ def _row(path: Path, entry: Entry) -> list[str]:
         first = as_printed(entry.figures[0])
         value, uncertainty = digits_of(first)
         figure = [first["name"], value, uncertainty, first["unit"]]
-    return [started, entry.machine, entry.test, entry.method, *figure, entry.verdict, entry.status, _shown(path)]
+    return [started, entry.machine, entry.test, entry.method, *figure, entry.verdict, entry.state, _shown(path)]
 
 
 def _plain(path: Path, entry: Entry) -> dict[str, Any]:

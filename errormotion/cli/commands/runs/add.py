@@ -1,0 +1,73 @@
+"""``errormotion add``: files of other software become runs of the record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import typer
+
+from errormotion.cli.commands.campaigns.run import describe, report_of_run, result_lines
+from errormotion.cli.options import read_settings
+from errormotion.cli.output import show, show_json
+from errormotion.cli.progress import Bars, on_terminal
+from errormotion.cli.tolerances import end_with, remarks
+from errormotion.record.adding.add import Added, Request
+from errormotion.record.adding.add import add as add_files
+from errormotion.record.adding.questions import Ask, Question, refuse, take_proposals
+
+
+def add(request: Request, assignments: Sequence[str], yes: bool, as_json: bool) -> None:
+    """Add the files of a request to the record, and print the results."""
+    request = replace(request, settings=lambda model: read_settings(model, None, assignments))
+    ask: Ask = take_proposals if yes else _asked if on_terminal() and not as_json else _refused
+    with Bars(as_json) as bars:
+        added = add_files(request, ask, report=report_of_run, stage=bars.stage)
+    conformity = added.folder.data.get("conformity")
+    if as_json:
+        described = describe(added.folder)
+        show_json({"ok": True, "known": added.known, **described, "notes": [*added.notes, *described["notes"]]})
+    else:
+        for line in _lines(added, request.files):
+            show(line)
+    end_with([conformity] if conformity else [])
+
+
+def _lines(added: Added, files: Sequence[Path]) -> list[str]:
+    names, folder = ", ".join(path.name for path in files), added.folder
+    if added.known:
+        return [f"{names}: in the record already, {folder.path}; --again adds it once more"]
+    machine, test = folder.data["bench"]["machine"], folder.data["test"]
+    lines = [*(f"note: {note}" for note in added.notes), *result_lines(folder)]
+    decided = [folder.data["conformity"]] if folder.data.get("conformity") else []
+    return [f"{names}: {test} of {machine}, in {folder.path}", *(f"  {line}" for line in lines), *remarks(decided)]
+
+
+def _refused(questions: Sequence[Question]) -> Mapping[str, str]:
+    """Raise an error that states how to answer the questions by options: nobody can be asked."""
+    refuse(questions)
+    return {}
+
+
+def _asked(questions: Sequence[Question]) -> Mapping[str, str]:
+    """Return the answers of a person; choices are numbered."""
+    answers = {}
+    for each in questions:
+        show(each.text, err=True)
+        values = [choice.value for choice in each.choices]
+        for number, choice in enumerate(each.choices, 1):
+            meaning = "" if choice.text == choice.value else f": {choice.text}"
+            show(f"  {number}  {choice.value}{meaning}", err=True)
+        default = str(values.index(each.proposed) + 1) if each.proposed in values else each.proposed
+        answer = ""
+        while not answer:
+            answer = str(typer.prompt("Number or text" if values else "Answer", default=default, err=True)).strip()
+            if not each.needed:
+                break
+        answers[each.key] = values[int(answer) - 1] if _is_number(answer, len(values)) else answer
+    return answers
+
+
+def _is_number(answer: str, count: int) -> bool:
+    return answer.isascii() and answer.isdigit() and 1 <= int(answer) <= count

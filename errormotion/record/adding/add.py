@@ -1,0 +1,351 @@
+"""``errormotion add``: files of other software become a run of the record.
+
+The files are copied first, into a folder that gets its name when the raw data are complete. Then the raw data are
+identified and reported, as those of a measured run. However that ends, the files are kept; the same command continues.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import xarray as xr
+
+from errormotion import datasets, plugins
+from errormotion.campaign.folder import RunFolder, first_entries, now
+from errormotion.campaign.runner import identify_run, report_run, settings_hash
+from errormotion.campaign.storage.journal import cause_of, journal
+from errormotion.datasets import provenance
+from errormotion.datasets.files.tomlfile import read_toml
+from errormotion.datasets.files.writing import replace_bytes
+from errormotion.errors import DatasetError, RunError, code_of
+from errormotion.plugins import Method
+from errormotion.record.adding.machines import remember
+from errormotion.record.adding.originals import KEPT, MAP, Original, keep, originals_of, run_of
+from errormotion.record.adding.questions import Ask, Choice, Question
+from errormotion.record.adding.reading import is_raw, owner_of, read_raw
+from errormotion.record.adding.statement import Statement, copy_logo, load_statement
+from errormotion.record.runs.listing import list_runs
+from errormotion.tolerances.table import load_tolerances
+
+log = logging.getLogger(__name__)
+
+MAX_NAME = 40
+"""Longest part of the name of a run folder that comes from a file, characters."""
+MAX_CHOICES = 20
+"""Largest number of machines that are offered."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is added, and what is stated about it; empty texts are not stated.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Files of one measurement.
+    runs : Path
+        The folder of runs.
+    machine, method, axis : str
+        Name of the machine, id of the method, axis that moved.
+    measured : str
+        Start of the measurement, ISO 8601, where the files do not state it.
+    test : str
+        Name of the test; by default method and axis.
+    map : Path, optional
+        The map of the files.
+    head : Path, optional
+        File of the statements for the head of the report.
+    tolerances : Path, optional
+        File of limits.
+    settings : callable
+        ``settings(model)`` returns the checked settings of the method.
+    answers : mapping of str to str
+        Answers to questions, by their keys.
+    again : bool
+        Whether files that are in the record become another run.
+    """
+
+    files: tuple[Path, ...]
+    runs: Path
+    machine: str = ""
+    method: str = ""
+    axis: str = ""
+    measured: str = ""
+    test: str = ""
+    map: Path | None = None
+    head: Path | None = None
+    tolerances: Path | None = None
+    settings: Callable[[Any], Any] = lambda model: model()
+    answers: Mapping[str, str] = field(default_factory=dict)
+    again: bool = False
+
+
+@dataclass(frozen=True)
+class Added:
+    """The run of added files; ``known`` states that it was in the record already, ``notes`` are those of the import."""
+
+    folder: RunFolder
+    known: bool
+    notes: tuple[str, ...] = ()
+
+
+def add(
+    request: Request,
+    ask: Ask,
+    *,
+    report: Callable[[Path], Path] | None = None,
+    stage: Callable[[str], None] = lambda name: None,  # noqa: ARG005
+) -> Added:
+    """Add files as a run, identify and report it.
+
+    Parameters
+    ----------
+    request : Request
+        The files, and what is stated about them.
+    ask : callable
+        Answers questions; see `errormotion.record.adding.questions`.
+    report : callable, optional
+        Writes the report of a run folder, and returns its path.
+    stage : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    Added
+        The run; that of an earlier call if the files are in the record.
+
+    Raises
+    ------
+    DatasetError
+        A file cannot be read, an answer is missing, or statements contradict the data: nothing was added.
+    RunError
+        The identification failed: the run folder with the files and the raw data is kept, and the message states how
+        to continue.
+    """
+    originals = originals_of(request.files)
+    before = None if request.again else run_of(originals.values(), request.runs)
+    if before is not None and before.finished:
+        return Added(before, known=True)
+    work = _Adding(request, originals, ask, stage)
+    if before is None:
+        folder = RunFolder.create(request.runs, _name(request.files[0].stem), uuid4().hex[:8], {}, work.fill)
+    else:
+        folder = before
+        with folder.locked():
+            folder.save(**work.fill(folder.path))
+    with folder.locked(), journal(folder.log), _failures(folder, request):
+        if issubclass(work.owner, Method):
+            stage("identifying")
+            identify_run(folder, work.owner(), work.settings)
+            if not request.test:
+                folder.data["test"] = f"{work.owner.info.id}-{_component(folder)}"
+        if report is not None:
+            stage("writing the report")
+            report_run(folder, report)
+        folder.save(status="finished", reason="")
+    remember(request.runs, str(folder.data["bench"]["machine"]), work.schema, work.answered)
+    return Added(folder, known=False, notes=work.notes)
+
+
+class _Adding:
+    """The import of files into a run folder: the copies, the map, the raw data, and the entries of ``run.json``."""
+
+    def __init__(
+        self, request: Request, originals: Mapping[Path, Original], ask: Ask, stage: Callable[[str], None]
+    ) -> None:
+        self.request, self.originals, self.ask, self.stage = request, originals, ask, stage
+        self.statement = load_statement(request.head) if request.head else Statement.model_validate(_NOTHING)
+        if request.map is not None:
+            read_toml(request.map)
+        self.limits = load_tolerances(request.tolerances) if request.tolerances else None
+        self.owner: Any = None
+        self.settings: Any = None
+        self.schema = ""
+        self.answered: dict[str, str] = {}
+        self.notes: tuple[str, ...] = ()
+
+    def fill(self, folder: Path) -> dict[str, Any]:
+        """Write copies, map and raw data into a folder, and return the entries of its ``run.json``."""
+        self.stage("copying the files")
+        copies = keep(self.originals, folder)
+        self.stage("reading the files")
+        map_file = self._map(copies, folder)
+        raw = read_raw(copies, map_file)
+        with _about(self.request.files):
+            self.owner = owner_of(raw)
+            raw = self._stated(raw, map_file is not None)
+            entries = self._entries(raw, map_file)
+        self.schema = str(raw.attrs["schema"])
+        self.notes = tuple(json.loads(str(raw.attrs.get("import_notes") or "[]")))
+        self.stage("storing the raw data")
+        datasets.save(raw, folder / "raw.zarr", overwrite=True)
+        raw.close()
+        if self.request.head is not None:
+            copy_logo(self.statement, self.request.head, folder)
+        return entries
+
+    def _map(self, copies: Sequence[Path], folder: Path) -> Path | None:
+        """Return the map in the folder; None for files that need none."""
+        map_file = folder / MAP
+        if self.request.map is not None:
+            replace_bytes(map_file, self.request.map.read_bytes())
+            return map_file
+        if all(is_raw(copy) for copy in copies):
+            return None
+        if map_file.exists():
+            return map_file
+        raise DatasetError(
+            f"{self.request.files[0]}: states no raw schema; describe its columns by a map: --map FILE",
+            code="add.map.missing",
+        )
+
+    def _stated(self, raw: xr.Dataset, mapped: bool) -> xr.Dataset:
+        """Return the raw data with what was stated about them.
+
+        Raises
+        ------
+        DatasetError
+            A statement contradicts the data.
+        """
+        request = self.request
+        found = {"imported": ", ".join(each.name for each in self.originals.values())}
+        stated = str(raw.attrs.get("machine", "")).replace("unknown", "")
+        known = "" if mapped else stated
+        if request.machine and known and request.machine.casefold() != known.casefold():
+            raise DatasetError(
+                f"--machine {request.machine}: the data are of the machine '{known}'; omit the option",
+                code="add.machine.contradiction",
+            )
+        found["machine"] = known or request.machine or stated or self._asked_machine()
+        if request.axis:
+            axis = str(raw.attrs.get("axis", request.axis))
+            if axis != request.axis:
+                raise DatasetError(
+                    f"--axis {request.axis}: the data are of the axis {axis}; omit the option",
+                    code="add.axis.contradiction",
+                )
+            found["axis"] = request.axis
+        if request.measured and "start" not in raw.attrs:
+            found["start"] = request.measured
+        if self.statement.operator:
+            found["operator"] = self.statement.operator
+        if self.statement.instruments and "instruments" not in raw.attrs:
+            found["instruments"] = json.dumps(self.statement.records(), ensure_ascii=False)
+        return raw.assign_attrs(found)
+
+    def _asked_machine(self) -> str:
+        machines = [name for name in _machines(self.request.runs) if name][:MAX_CHOICES]
+        question = Question(
+            "machine",
+            "On which machine was this measured?",
+            tuple(Choice(name, name) for name in machines),
+            machines[0] if len(machines) == 1 else "",
+        )
+        return self.ask([question])["machine"]
+
+    def _entries(self, raw: xr.Dataset, map_file: Path | None) -> dict[str, Any]:
+        request, owner = self.request, self.owner
+        start, source = _start(raw, request.files)
+        entries = first_entries() | {
+            "acquired": True,
+            "test": request.test or owner.info.id,
+            "bench": {"machine": raw.attrs["machine"]},
+            KEPT: {
+                "files": [each.plain() for each in self.originals.values()],
+                "map": map_file.name if map_file is not None else None,
+            },
+            "created": start,
+            "created_from": source,
+            "added": now(),
+            "method": {"id": ""},
+            "operator": str(raw.attrs.get("operator", "")),
+            "head": self.statement.stated(),
+            "instruments": json.loads(str(raw.attrs.get("instruments", "[]"))),
+            "tolerances": self.limits.model_dump(mode="json") if self.limits else None,
+            "errors": None,
+            "results": None,
+            "conformity": None,
+        }
+        if not issubclass(owner, Method):
+            return entries
+        if request.method and plugins.get("methods", request.method) is not owner:
+            raise DatasetError(
+                f"--method {request.method}: the data are of the method '{owner.info.id}'; omit the option",
+                code="add.method.contradiction",
+            )
+        self.settings = request.settings(owner.Settings)
+        settings = provenance.plain(provenance.of_evaluation(self.settings, raw))
+        return entries | {
+            "method": {"id": owner.info.id, "version": owner.info.version, "status": owner.info.status},
+            "settings": settings,
+            "settings_hash": settings_hash(settings, owner.info.id, owner.info.version),
+        }
+
+
+_NOTHING = {"schema": "errormotion.head/1"}
+
+
+def _name(stem: str) -> str:
+    """Return a text for the name of a run folder."""
+    return re.sub(r"[^\w-]+", "-", stem, flags=re.ASCII).strip("-")[:MAX_NAME] or "file"
+
+
+def _component(folder: RunFolder) -> str:
+    """Return the component to which the errors of a run belong, such as an axis."""
+    with datasets.load(folder.errors or folder.path) as errors:
+        return str(errors.attrs["component"])
+
+
+def _machines(runs: Path) -> Sequence[str]:
+    return list_runs([runs]).machines if runs.is_dir() else ()
+
+
+def _start(raw: xr.Dataset, files: Sequence[Path]) -> tuple[str, str]:
+    """Return the start of the measurement, and where it is from if nothing states it."""
+    stated = str(raw.attrs.get("start", ""))
+    if stated:
+        return stated, ""
+    changed = min(path.stat().st_mtime for path in files)
+    return datetime.fromtimestamp(changed, UTC).isoformat(timespec="seconds"), "last change of the file"
+
+
+@contextmanager
+def _about(files: Sequence[Path]) -> Iterator[None]:
+    """Name the file in errors that do not."""
+    try:
+        yield
+    except DatasetError as error:
+        if not str(error).startswith("--") and files[0].name not in str(error):
+            error.args = (f"{files[0]}: {error}",)
+        raise
+
+
+@contextmanager
+def _failures(folder: RunFolder, request: Request) -> Iterator[None]:
+    """Record the failure of a run in its ``run.json`` and its log, and state how to continue."""
+    again = "Repeat 'errormotion add' with the same files, and with other options if necessary, to continue this run."
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        folder.step("stop", "interrupted")
+        folder.save(status="interrupted", reason="stopped by the operator")
+        raise KeyboardInterrupt(f"The files are kept in {folder.path}. {again}") from error
+    except Exception as error:
+        log.exception("failed")
+        folder.step("stop", "failed", reason=cause_of(error))
+        folder.save(status="failed", reason=cause_of(error))
+        names = ", ".join(path.name for path in request.files)
+        raise RunError(
+            f"{names}: {cause_of(error)}\nThe files and the raw data are kept in {folder.path}; the log is "
+            f"{folder.log}. {again}",
+            code=code_of(error, "add.failed"),
+        ) from error
