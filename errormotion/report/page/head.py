@@ -67,11 +67,16 @@ def head_of(run: Mapping[str, Any]) -> Head:
     logo = logo if isinstance(logo, str) and logo.startswith("data:image/") and len(logo) <= MAX_LOGO else ""
     names = ("laboratory", "address", "accreditation", "customer", "order", "number", "language", "paper")
     until = {name: day for name, each in _pairs(stated, "calibrated_until") if (day := _day(each)) is not None}
-    facts = {
-        key: {name: str(each) for name, each in _pairs(stated, key)}
-        for key in ("certificates", "environment", "conditions")
-    }
-    return Head(**{name: text(name) for name in names}, logo=logo, calibrated_until=until, **facts)
+    facts = ("certificates", "environment", "conditions")
+    certificates, environment, conditions = ({name: str(each) for name, each in _pairs(stated, key)} for key in facts)
+    return Head(
+        **{name: text(name) for name in names},
+        logo=logo,
+        calibrated_until=until,
+        certificates=certificates,
+        environment=environment,
+        conditions=conditions,
+    )
 
 
 def _pairs(stated: Mapping[str, Any], name: str) -> list[tuple[str, Any]]:
