@@ -28,6 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
 
 from errormotion.arrays import Array
 from errormotion.estimation.checks.correlated import autoregressive
@@ -52,6 +53,8 @@ POSITIVE = ("G(CCW)", "G(CW)", "G(b)", "H")
 DRAWS = 200
 DECAYS = (1 / 12, 1 / 6, 1 / 3, 2 / 3, 1.0, 2.0)
 """Decays of spikes relative to the setting."""
+FALSE_ALARM = 1e-3
+"""Probability that noise makes the model of a path seem wrong."""
 READINGS_EACH = 3
 """Mean number of readings in a sector of the path of the figures."""
 OF_DECAY, PARTS = 24, (1, 8)
@@ -73,21 +76,28 @@ def of_circles(circles: Circles, settings: CircularTestSettings, phi: float = 0.
 
     The mean over a sector reduces a spike at a reversal, on the unsafe side. The path has therefore as many sectors as
     have about `READINGS_EACH` readings, plus the model of the path within each of them, with the decay of its spikes
-    among `DECAYS` that fits the readings best. Where the model does not describe the path, a part of the spike is still
-    lost. It is estimated by the change from sectors of twice the width, and contained in the uncertainty.
+    among `DECAYS` that fits the readings best. Where neighbouring sectors differ from the model by more than their
+    noise, a part of a spike is still lost. It is estimated by the change from sectors of twice the width, and contained
+    in the uncertainty.
     """
     decays = [factor * settings.spike_decay for factor in DECAYS]
     decay = min(decays, key=lambda each: float(np.nansum((circles.deviation - circles.model(each)[0]) ** 2)))
     each = int(np.isfinite(circles.length).sum()) / 2 / (READINGS_EACH * settings.places)
     widths = [max(1, int(each) // part) for part in (1, 2)]
-    fine, coarse = (_of_sectors(circles, settings, settings.places * width, decay, phi) for width in widths)
-    if widths[0] == widths[1]:
+    fine, described = _of_sectors(circles, settings, settings.places * widths[0], decay, phi)
+    if described or widths[0] == widths[1]:
         return fine
+    coarse, _ = _of_sectors(circles, settings, settings.places * widths[1], decay, phi)
     return replace(fine, covariance=fine.covariance + np.diag((fine.value - coarse.value) ** 2))
 
 
-def _of_sectors(circles: Circles, settings: CircularTestSettings, places: int, decay: float, phi: float) -> Figures:
-    """Return the figures of means over a number of sectors plus the model of the path within them."""
+def _of_sectors(
+    circles: Circles, settings: CircularTestSettings, places: int, decay: float, phi: float
+) -> tuple[Figures, bool]:
+    """Return the figures of means over sectors plus the model of the path within them, and whether it describes them.
+
+    It does if no step between neighbouring sectors that it leaves is larger than their noise explains.
+    """
     sectors = problem_of(circles, settings, places, decay, [])
     problem = sectors.problem
     if phi > 0:
@@ -97,14 +107,17 @@ def _of_sectors(circles: Circles, settings: CircularTestSettings, places: int, d
     found = circles.model(decay)[1]
     parts = 2 * int(np.clip(np.ceil(OF_DECAY / 2 * TAU / places / decay), *PARTS))
     within = circles.over_sectors(places * parts, decay) @ found
-    shape = within - np.repeat(circles.over_sectors(places, decay) @ found, parts, axis=1)
+    modelled = circles.over_sectors(places, decay) @ found
+    shape = within - np.repeat(modelled, parts, axis=1)
     value, u = errors.value.reshape(2, -1), np.sqrt(errors.own).reshape(2, -1)
+    step = np.diff(value - modelled, axis=1) / np.hypot(u[:, 1:], u[:, :-1])
+    described = bool(np.nanmax(np.abs(step)) <= norm.isf(FALSE_ALARM / (2 * step.size)))
     shared = np.array([source.effect for source in sources]).reshape(-1, 2, places)
     its = of_path(value, np.where(np.isfinite(value), u, np.nan), shared, shape, [each.name for each in sources])
     # The mean over a part reduces a spike as well: by as much as parts of twice the width reduce it further
     wide = np.repeat(shape.reshape(2, -1, 2).mean(axis=2), 2, axis=1)
     lost, less = (evaluate(np.repeat(value, parts, axis=1) + each) for each in (shape, wide))
-    return replace(its, covariance=its.covariance + np.diag((lost - less) ** 2))
+    return replace(its, covariance=its.covariance + np.diag((lost - less) ** 2)), described
 
 
 def of_path(

@@ -38,7 +38,7 @@ class CircularTest(ModelMethod):
         id="circular_test",
         summary="Circular test after ISO 230-4 with a telescoping ballbar",
         status="simulated_only",
-        version="4",
+        version="5",
         former=("ballbar",),
         cannot_see=(
             "errors across the bar: only the radial displacement is measured",

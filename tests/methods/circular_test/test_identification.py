@@ -92,7 +92,6 @@ def ratios():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_intervals_of_the_parameters_hold_the_truth(ratios):
     held = (np.abs(ratios["parameters"]) <= 1.96).sum(axis=0)
     low, high = stats.binom.ppf([FALSE_ALARM / 20, 1 - FALSE_ALARM / 20], SEEDS, 0.95)
@@ -102,18 +101,16 @@ def test_intervals_of_the_parameters_hold_the_truth(ratios):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_intervals_of_the_figures_hold_the_truth(ratios):
     """Extreme values are not normal variables; two standard uncertainties contain the truth in 95 % of tests."""
     held = (np.abs(ratios["figures"]) <= 2).sum(axis=0)
     low = stats.binom.ppf(FALSE_ALARM / 7, SEEDS, 0.95)
     assert dict(zip(NAMES, held >= low, strict=True)) == dict.fromkeys(NAMES, True)
-    # The uncertainty is not much too large; that of H is the largest, with 0.38.
-    assert (np.mean(ratios["figures"] ** 2, axis=0) > 0.35).all()
+    # The uncertainty is not much too large.
+    assert (np.mean(ratios["figures"] ** 2, axis=0) > 0.4).all()
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize("decay", [1.0, 3.0])
 def test_a_spike_is_not_reduced_by_the_width_of_a_sector(decay):
     """G, H and F of the path itself: the mean over 2 degrees of a spike of 3 degrees is a quarter smaller."""
