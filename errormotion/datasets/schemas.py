@@ -5,8 +5,10 @@ This module contains the table of error datasets. The tables of raw datasets are
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+
+import xarray as xr
 
 from errormotion import plugins
 from errormotion.kinematics.iso import DOF
@@ -85,6 +87,17 @@ class RawSchema:
         Labels that a dimension must have, all of them and no others.
     aliases : mapping of str to str
         Short names of columns in text files, and the full names.
+    words : mapping of str to tuple of str
+        Names that columns of others' files have for a variable, a dimension or one of its labels, in lower case; any
+        language. The usual ones, such as time and temperature, are known without.
+    attributes : mapping of str to tuple of str
+        Attributes that an imported dataset needs, and their values; no values: any text.
+    asked : tuple of str
+        Optional variables that a person is asked for at an import.
+    stated : tuple of Row
+        Values that a map may state in place of variables; `imported` converts them.
+    imported : callable, optional
+        Returns an imported dataset, with the values of `stated`, as one of the schema; None: it is one.
     """
 
     id: str
@@ -94,6 +107,11 @@ class RawSchema:
     sizes: Mapping[str, int] = field(default_factory=dict)
     labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     aliases: Mapping[str, str] = field(default_factory=dict)
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    attributes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    asked: tuple[str, ...] = ()
+    stated: tuple[Row, ...] = ()
+    imported: Callable[[xr.Dataset], xr.Dataset] | None = None
 
     @property
     def title(self) -> str:

@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,35 +52,77 @@ def read_log(log: Path, map_file: Path) -> xr.Dataset:
     """
     settings = load_model(map_file, LogMap)
     map_mistakes = Mistakes(map_file)
-    names = Names.of(_tables(settings, map_mistakes), _free_labels(settings))
-    checked = {where: _column(where, entry, names, map_mistakes) for where, entry in settings.columns.items()}
-    columns = {base_key(where): column for where, column in checked.items()}
+    names = names_of([settings], map_mistakes)
+    checked = checked_columns(settings, names, map_mistakes)
+    map_mistakes.raise_any()
+    table, found = read_file(log, settings.format), Found()
+    read_values(settings, table, names, found, map_mistakes)
+    map_mistakes.raise_any()
+    start, notes = read_part(table, settings, checked, names, found)
+    return finished(settings, names, found, start, notes)
+
+
+def names_of(parts: Sequence[LogMap], mistakes: Mistakes) -> Names:
+    """Return the variables of a schema and the labels of the parts of a map, which have one schema and variant."""
+    tables = _tables(parts[0], mistakes)
+    labels: dict[str, tuple[str, ...]] = {}
+    for settings in parts:
+        for dim, found in _free_labels(settings).items():
+            labels[dim] = (*(each for each in labels.get(dim, ()) if each not in found), *found)
+    names = Names.of(tables, labels)
+    stated = {row.name: row for table in reversed(tables) for row in table.stated}
+    return replace(names, rows={**stated, **names.rows})
+
+
+def checked_columns(settings: LogMap, names: Names, mistakes: Mistakes) -> dict[str, Column]:
+    """Return the columns of a map by variable and component; mistakes for those that the schema does not have."""
+    checked = {where: _column(where, entry, names, mistakes) for where, entry in settings.columns.items()}
     dims = {dim for row in names.rows.values() for dim in names.record_dims(row)}
     stated = {f"labels.{dim}": dim for dim in settings.labels}
     stated |= {f"columns.{key}.labels.{dim}": dim for key, each in settings.columns.items() for dim in each.labels}
     for where, dim in stated.items():
         if dim not in dims:
-            map_mistakes.add(0, f"{where}: unknown dimension; {nearest(dim, dims)}")
+            mistakes.add(0, f"{where}: unknown dimension; {nearest(dim, dims)}")
     if settings.sequence is not None and not {"run", "approach", "target"} <= dims:
-        map_mistakes.add(0, "sequence: expected a schema with run, approach and target; found none of them")
-    map_mistakes.raise_any()
-    table, found = read_file(log, settings.format), Found()
+        mistakes.add(0, "sequence: expected a schema with run, approach and target; found none of them")
+    return {base_key(where): column for where, column in checked.items() if column is not None}
+
+
+def read_values(settings: LogMap, table: Table, names: Names, found: Found, mistakes: Mistakes) -> None:
+    """Read the values of a map, and those at the top of a table, into ``found``."""
     for name, value in settings.values.items():
-        _read_value(name, value, table, names, found, map_mistakes)
-    map_mistakes.raise_any()
-    known = {key: column for key, column in columns.items() if column is not None}
-    mistakes = Mistakes(log)
+        _read_value(name, value, table, names, found, mistakes)
+
+
+def read_part(
+    table: Table, settings: LogMap, columns: Mapping[str, Column], names: Names, found: Found
+) -> tuple[str, list[str]]:
+    """Read the columns of a table into ``found``; return its first date, and notes.
+
+    Raises
+    ------
+    DatasetError
+        Cells are wrong; all mistakes of the table are reported together.
+    """
+    mistakes = Mistakes(table.path)
     read = _columns(table, settings, mistakes)
-    for part, columns_of_part, keys in _parts(read, known, settings, names, mistakes):
+    for part, columns_of_part, keys in _parts(read, columns, settings, names, mistakes):
         for text in incomplete(columns_of_part, keys, names):
             mistakes.add(0, text)
         if not mistakes.count:
             read_table(part, columns_of_part, keys, names, found, mistakes)
     mistakes.raise_any()
-    notes = read.notes + _missing_rows(read.cells, read.keys)
-    known_attrs = {"machine": settings.machine, "start": read.start, NOTES: json.dumps(notes) if notes else ""}
-    attrs = {**settings.attributes, **{name: text for name, text in known_attrs.items() if text}}
-    return found.dataset({"schema": settings.schema_, **attrs}, names)
+    return read.start, read.notes + _missing_rows(read.cells, read.keys)
+
+
+def finished(settings: LogMap, names: Names, found: Found, start: str, notes: Sequence[str]) -> xr.Dataset:
+    """Return what was read as a dataset of the schema."""
+    known = {"machine": settings.machine, "start": start, NOTES: json.dumps(notes) if notes else ""}
+    attrs = {**settings.attributes, **{name: text for name, text in known.items() if text}}
+    raw = found.dataset({"schema": settings.schema_, **attrs}, names)
+    tables = [each for each in variants(settings.schema_) if not settings.variant or each.variant == settings.variant]
+    table = next((each for each in tables if each.marker in raw.variables or each.marker in raw.dims), tables[0])
+    return table.imported(raw) if table.imported is not None else raw
 
 
 def _tables(settings: LogMap, mistakes: Mistakes) -> Sequence[RawSchema]:
@@ -127,7 +169,7 @@ def _column(key: str, entry: MappedColumn, names: Names, mistakes: Mistakes) -> 
         return None
     offset = _quantity(entry.offset, row, f"{where}.offset", mistakes) if entry.offset else 0.0
     component = labels.index(label) if dot else None
-    return Column(row, component, unit, entry.scale, offset, component is None or row.missing)
+    return Column(row, component, unit, entry.scale, offset, component is None or row.missing or not row.required)
 
 
 def _quantity(text: str, row: Row, where: str, mistakes: Mistakes) -> float:
@@ -219,6 +261,8 @@ def _columns(table: Table, settings: LogMap, mistakes: Mistakes) -> _Columns:
     if settings.sequence is not None:
         wanted["sequence"] = settings.sequence
     wanted |= {f"columns.{key}": entry.column for key, entry in settings.columns.items()}
+    subtracted = {key: entry.minus for key, entry in settings.columns.items() if entry.minus is not None}
+    wanted |= {f"minus.{key}": place for key, place in subtracted.items()}
     places = places_of(table, wanted, mistakes)
     titles = {key: f"column '{table.titles[where[0]]}'" for key, where in places.items()}
     dated = {f"columns.{key}": entry.unit for key, entry in settings.columns.items() if is_date(entry.unit)}
@@ -244,6 +288,8 @@ def _columns(table: Table, settings: LogMap, mistakes: Mistakes) -> _Columns:
         else:
             numbers[k] = values[place[0]]
         if where.startswith("columns"):
+            if minus := places.get(f"minus.{where.partition('.')[2]}"):
+                numbers[k] = numbers[k] - values[minus[0]]
             columns.setdefault(base_key(where.partition(".")[2]), []).append(k)
     heads = [table.titles[where[0]] for where in places.values()]
     if settings.sequence is not None and not mistakes.count:

@@ -23,6 +23,9 @@ class MappedColumn(LogTable):
         1.0, allow_inf_nan=False, description="factor of the cells; -1 if they count in the opposite direction"
     )
     offset: str = Field("", description="added after scaling, with its unit, such as '2 mm'")
+    minus: Column | None = Field(
+        None, description="column of the same unit that is subtracted, such as the targets from the positions"
+    )
     labels: dict[str, str | int] = Field(
         default_factory=dict, description="number or name along each dimension that the readings of this column have"
     )

@@ -1,0 +1,55 @@
+"""Units of columns: as programs write them, and as they fit a variable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from errormotion.datasets.schemas import Row
+from errormotion.datasets.tables.dates import fitting
+from errormotion.datasets.tables.table import same
+from errormotion.datasets.text.table_reader import unit_of_freedom
+from errormotion.datasets.units import convert
+from errormotion.errors import DatasetError
+
+_WRITTEN = {
+    **{"c": "degC", "°c": "degC", "deg c": "degC", "grad c": "degC", "celsius": "degC", "grad": "degC", "f": "degF"},
+    **{"mu": "um", "micron": "um", "microns": "um", "mikrometer": "um", "my": "um", "millimeter": "mm", "mü": "um"},
+    **{"sek": "s", "sec": "s", "secs": "s", "seconds": "s", "sekunden": "s", "minuten": "min", "minutes": "min"},
+    **{"std": "h", "stunden": "h", "hours": "h", "hrs": "h", "msec": "ms", "tage": "day", "days": "day", "d": "day"},
+    **{"u/min": "/min", "upm": "/min", "rev/min": "/min", "°": "deg", "grd": "deg", '"': "arcsec", "''": "arcsec"},
+    **{"arcsec": "arcsec", "arc sec": "arcsec", "sec of arc": "arcsec", "winkelsekunden": "arcsec", "as": "arcsec"},
+    **{"urad": "urad", "µrad": "urad", "mikrorad": "urad", "%rh": "%", "% rh": "%", "% r.f.": "%", "rel. %": "%"},
+}
+"""Units of programs that have another form or no meaning elsewhere, in lower case."""
+_ORDER_IS_OPEN = 400
+"""Number of dates from which their order is recognised."""
+
+
+def fitting_unit(text: str, row: Row, freedom: str = "") -> str:
+    """Return a unit of a file in a form that is convertible to that of a variable; empty if there is none."""
+    plain = same(text).strip()
+    decided = unit_of_freedom(row, freedom) if freedom else ""
+    goals = (decided,) if decided else row.units or (row.unit or "1",)
+    for unit in (plain, _WRITTEN.get(plain.lower(), ""), plain.lower() if plain.isupper() else ""):
+        for goal in goals:
+            if not unit:
+                continue
+            try:
+                convert(1.0, unit, goal)
+            except DatasetError:
+                continue
+            return unit
+    return ""
+
+
+def orders(texts: Sequence[str]) -> list[str]:
+    """Return the units with which all dates of a column can be read, the most usual first; empty for other texts."""
+    filled = [text for text in texts if text]
+    some = filled[:: max(1, len(filled) // _ORDER_IS_OPEN)]
+    found = fitting(some)
+    if len(found) > 1:  # a day after the 12th shows the order
+        days: dict[str, str] = {}
+        for text in filled:
+            days.setdefault(text[:10], text)
+        found = [unit for unit in fitting(list(days.values())) if unit in found]
+    return found
