@@ -96,6 +96,8 @@ class RawSchema:
         Optional variables that a person is asked for at an import.
     stated : tuple of Row
         Values that a map may state in place of variables; `imported` converts them.
+    derived : tuple of str
+        Required variables that `imported` computes.
     imported : callable, optional
         Returns an imported dataset, with the values of `stated`, as one of the schema; None: it is one.
     """
@@ -111,6 +113,7 @@ class RawSchema:
     attributes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     asked: tuple[str, ...] = ()
     stated: tuple[Row, ...] = ()
+    derived: tuple[str, ...] = ()
     imported: Callable[[xr.Dataset], xr.Dataset] | None = None
 
     @property

@@ -1,8 +1,24 @@
 """Schema of the log of a monitor."""
 
+import numpy as np
+import xarray as xr
+
 from errormotion.datasets.schemas import DIRECTION, NO_LIMIT, POSITION, XYZ, RawSchema, Row
 
 SCHEMA = "errormotion.raw.monitor/1"
+
+
+def _with_gaps(raw: xr.Dataset) -> xr.Dataset:
+    """Return an imported log with its gaps: the rows in which no reading of the file is known."""
+    readings = [
+        raw[name] for name in ("temperature", "position", "spindle_speed", "spindle_load", "feed") if name in raw
+    ]
+    if "gap" in raw or not readings:
+        return raw
+    empty = [np.isnan(each).all([dim for dim in each.dims if dim != "time"]).values for each in readings]
+    gap = np.logical_and.reduce(empty).astype(float)[:, None]
+    return raw.assign(gap=(("time", "source"), gap, {"units": "1"})).assign_coords(source=["file"])
+
 
 RAW_SCHEMAS = (
     RawSchema(
@@ -27,5 +43,7 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        derived=("gap",),
+        imported=_with_gaps,
     ),
 )

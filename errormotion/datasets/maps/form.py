@@ -9,12 +9,25 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.schemas import RawSchema, Row, raw_schemas, variants
+from errormotion.datasets.tables.dates import is_date
 from errormotion.datasets.tables.format import Column, Format, LogTable
 from errormotion.datasets.text.log_map import MappedColumn, MappedLabels, MappedValue, base_key
 
 MAP_SCHEMA = "errormotion.map/2"
 SEQUENCE = ("run", "approach", "target")
 """Dimensions that follow from the positions of readings in the order of measurement."""
+
+
+class MapColumn(MappedColumn):
+    """A column whose unit may be stated in the file."""
+
+    @model_validator(mode="after")
+    def _two_columns_are_dates(self) -> Self:
+        if isinstance(self.column, list) and self.unit and not is_date(self.unit):
+            raise ValueError(
+                "column: two columns are date and time of day; expected the unit 'iso8601' or 'dd.mm.yyyy'"
+            )
+        return self
 
 
 class MapTable(LogTable):
@@ -29,7 +42,7 @@ class MapTable(LogTable):
     format: Format = Field(default_factory=lambda: Format.model_validate({}))
     labels: dict[str, MappedLabels] = Field(default_factory=dict, description="columns with labels, by dimension")
     sequence: Column | None = Field(None, description="column with the positions, in the order of measurement")
-    columns: dict[str, MappedColumn] = Field(default_factory=dict, description="columns by variable")
+    columns: dict[str, MapColumn] = Field(default_factory=dict, description="columns by variable")
     units: dict[str, str] = Field(default_factory=dict, description="units that the file does not state, by variable")
 
     @field_validator("units")
@@ -145,9 +158,7 @@ def _entries(
             yield name, {"column": entry}
             return
         if labels and len(labels) != len(entry):
-            raise ValueError(
-                f"columns.{name}: expected {len(labels)} columns ({' '.join(labels)}); found {len(entry)}"
-            )
+            raise ValueError(f"columns.{name}: expected {len(labels)} columns ({' '.join(labels)}); found {len(entry)}")
         yield from _components(name, dict(zip(labels or map(str, entry), entry, strict=True)), row, dim, schemas)
     elif _is_place(entry):
         yield name, {"column": entry}

@@ -196,9 +196,9 @@ def date_units(table: Table, columns: Sequence[int]) -> list[str]:
 
 
 def _interpolated(own: Found, began: str, found: Found, start: str, table: Table) -> list[str]:
-    """Add the variables of another file to those of the readings, at the times of the readings, linearly between its own.
+    """Add the variables of another file to those of the readings, at the times of the readings; return a note.
 
-    Returns a note. Values beyond the times of the file are NaN.
+    They are linear between the times of the file. Values beyond the times of the file are NaN.
 
     Raises
     ------
@@ -239,5 +239,3 @@ def _interpolated(own: Found, began: str, found: Found, start: str, table: Table
 
 def _aware(text: str) -> bool:
     return datetime.fromisoformat(text).tzinfo is not None
-
-

@@ -63,6 +63,11 @@ class Mistakes:
         elif len(self._kinds) < _MAX_KINDS:
             self._kinds[key] = _Kind([(line, text)])
 
+    @property
+    def first(self) -> str:
+        """Text of the first mistake; empty if there is none."""
+        return next((kind.first[0][1] for kind in self._kinds.values()), "")
+
     def raise_any(self) -> None:
         """Raise DatasetError if there are any."""
         if self.count:

@@ -7,7 +7,7 @@ from pathlib import Path
 from errormotion.datasets.files.reading import read_bytes, require_regular
 from errormotion.datasets.tables.binary import binary_table
 from errormotion.datasets.tables.format import Format
-from errormotion.datasets.tables.sheets import sheet_table
+from errormotion.datasets.tables.sheets import sheet_table, sheet_tables
 from errormotion.datasets.tables.table import Table
 from errormotion.datasets.tables.text import MAX_LINE, text_table
 from errormotion.errors import DatasetError
@@ -23,6 +23,19 @@ _BINARY = (
     (b"CDF\x02", "netcdf3"),
 )
 _SHEETS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")
+
+
+def read_tables(path: Path, form: Format) -> list[Table]:
+    """Return the tables of a file: of all sheets of a spreadsheet, else the only one; raises like `read_table`."""
+    try:
+        require_regular(path)
+        with path.open("rb") as file:
+            start = file.read(16)
+        if start.startswith(_SHEETS):
+            return sheet_tables(read_bytes(path, MAX_FILE), path, form)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}", code="file.unreadable") from error
+    return [read_table(path, form)]
 
 
 def read_table(path: str | Path, form: Format | None = None) -> Table:

@@ -33,6 +33,24 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
     DatasetError
         The file cannot be read, has no such sheet, no sheet with numbers, or several.
     """
+    tables = sheet_tables(data, path, form)
+    if len(tables) > 1:
+        found = ", ".join(f"'{table.form.sheet}'" for table in tables)
+        raise DatasetError(
+            f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map",
+            code="file.sheet.several",
+        )
+    return tables[0]
+
+
+def sheet_tables(data: bytes, path: Path, form: Format) -> list[Table]:
+    """Return the tables of all sheets with rows of numbers, or of the stated one.
+
+    Raises
+    ------
+    DatasetError
+        The file cannot be read, has no such sheet, or no sheet with numbers.
+    """
     from python_calamine import CalamineError, CalamineWorkbook
 
     try:
@@ -63,13 +81,7 @@ def sheet_table(data: bytes, path: Path, form: Format) -> Table:
         raise DatasetError(
             f"{path}: expected rows of numbers in sheet {', '.join(wanted)}; found none", code="file.no_numbers"
         )
-    if len(tables) > 1:
-        found = ", ".join(f"'{table.form.sheet}'" for table in tables)
-        raise DatasetError(
-            f"{path}: expected one sheet with a table; found {found}. Set format.sheet in the map",
-            code="file.sheet.several",
-        )
-    return tables[0]
+    return tables
 
 
 def _require_small(data: bytes, path: Path) -> None:

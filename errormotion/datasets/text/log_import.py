@@ -91,7 +91,7 @@ def checked_columns(settings: LogMap, names: Names, mistakes: Mistakes) -> dict[
 def read_values(settings: LogMap, table: Table, names: Names, found: Found, mistakes: Mistakes) -> None:
     """Read the values of a map, and those at the top of a table, into ``found``."""
     for name, value in settings.values.items():
-        _read_value(name, value, table, names, found, mistakes)
+        read_value(name, value, table, names, found, mistakes)
 
 
 def read_part(
@@ -183,7 +183,7 @@ def _quantity(text: str, row: Row, where: str, mistakes: Mistakes) -> float:
     return value - zero
 
 
-def _read_value(name: str, entry: MappedValue, table: Table, names: Names, found: Found, mistakes: Mistakes) -> None:
+def read_value(name: str, entry: MappedValue, table: Table, names: Names, found: Found, mistakes: Mistakes) -> None:
     """Read a variable whose value is in the map, or in the first lines of the log after a key that the map states."""
     row, where = names.rows.get(name), f"values.{name}"
     if row is None:

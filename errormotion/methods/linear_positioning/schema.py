@@ -153,6 +153,9 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        words={"target_position": ("position", "pos", "sollposition", "soll", "target", "nominal", "zielposition")},
+        attributes={"axis": ("X", "Y", "Z")},
+        asked=("functional_point", "length_uncertainty"),
     ),
     RawSchema(
         SCHEMA,

@@ -72,5 +72,6 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        attributes={"axis": ("A", "B", "C")},
     ),
 )

@@ -12,6 +12,7 @@ from errormotion.datasets.schemas import (
     RawSchema,
     Row,
 )
+from errormotion.methods.spindle_drift.imported_beams import with_beam_covariance
 
 SCHEMA = "errormotion.raw.spindle_drift/1"
 """Id of all raw schemas of the method."""
@@ -95,6 +96,12 @@ RAW_SCHEMAS = (
         sizes={**DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
         labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
         aliases={"reading": "distance"},
+        words={"distance": ("sensor", "messtaster", "gap")},
+        stated=(
+            Row("beam_origin_uncertainty", ("channel",), "m", *NOISE, "standard uncertainty of each coordinate"),
+            Row("beam_direction_uncertainty", ("channel",), "rad", 0.0, 0.1, "standard uncertainty across the beam"),
+        ),
+        imported=with_beam_covariance,
     ),
     RawSchema(
         SCHEMA,

@@ -115,5 +115,6 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        attributes={"axis": ("A", "B", "C")},
     ),
 )

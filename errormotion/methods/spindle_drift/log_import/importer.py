@@ -16,6 +16,7 @@ from errormotion.datasets.tables.table import Place
 from errormotion.datasets.text.log_reader import NOTES, Columns, holes, read_columns
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
+from errormotion.methods.spindle_drift.imported_beams import with_beam_covariance
 from errormotion.methods.spindle_drift.log_import.import_map import (
     MAP_SCHEMA,
     Channel,
@@ -25,11 +26,8 @@ from errormotion.methods.spindle_drift.log_import.import_map import (
     TimeColumn,
 )
 from errormotion.methods.spindle_drift.schema import CHANNELS, RAW_SCHEMAS
-from errormotion.methods.spindle_drift.settings import SpindleDriftSettings
 
 _DRIFT = RAW_SCHEMAS[0]
-_ORIGIN = float(SpindleDriftSettings.model_fields["nominal_origin_uncertainty"].default)
-_DIRECTION = float(SpindleDriftSettings.model_fields["nominal_direction_uncertainty"].default)
 _ROWS = {row.name: row for row in _DRIFT.rows}
 _VARIABLE = {"time": "time", "channels": "distance", "temperatures": "temperature", "spindle_speed": "spindle_speed"}
 
@@ -133,7 +131,9 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
         "height": ["L1", "L2"],
         "time": (("time",), inside["time"], {"units": "s"}),
     }
-    variables["beam_covariance"] = (("channel", "p", "p_"), _beam_covariance(settings, direction))
+    if channels[0].origin_uncertainty is not None:
+        for name in ("origin_uncertainty", "direction_uncertainty"):
+            variables[f"beam_{name}"] = (("channel",), [getattr(channel, name) for channel in channels])
     if settings.temperatures:
         temperature = np.stack([inside[f"temperatures.{name}"] for name in settings.temperatures], axis=1)
         variables["temperature"] = (("time", "sensor"), temperature, {"units": "degC"})
@@ -147,24 +147,6 @@ def _raw_dataset(columns: Columns, settings: ImportMap) -> xr.Dataset:
     }
     attrs |= {name: value for name, value in (("machine", settings.machine), ("start", columns.start)) if value}
     notes = [*holes(inside["time"], columns.lines), *columns.notes]
-    if channels[0].origin_uncertainty is None:
-        notes.append(
-            f"The map states no uncertainty of the beams: {1e3 * _ORIGIN:g} mm and {1e3 * _DIRECTION:g} mrad are "
-            "assumed, as for a frame that was not calibrated."
-        )
-        attrs["beam_uncertainty"] = "assumed"
     if notes:
         attrs[NOTES] = json.dumps(notes)
-    return xr.Dataset(variables, coords, attrs)
-
-
-def _beam_covariance(settings: ImportMap, direction: Array) -> Array:
-    """Return (channel, 6, 6): equal in each coordinate of the origin, and across the beam in the direction."""
-    C = np.zeros((len(CHANNELS), 6, 6))
-    for k, name in enumerate(CHANNELS):
-        channel, u = settings.channels[name], direction[k]
-        origin = _ORIGIN if channel.origin_uncertainty is None else channel.origin_uncertainty
-        across = _DIRECTION if channel.direction_uncertainty is None else channel.direction_uncertainty
-        C[k, :3, :3] = origin**2 * np.eye(3)
-        C[k, 3:, 3:] = across**2 * (np.eye(3) - np.outer(u, u))
-    return C
+    return with_beam_covariance(xr.Dataset(variables, coords, attrs))

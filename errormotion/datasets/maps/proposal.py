@@ -1,0 +1,314 @@
+"""A proposed map of files: the tables as they were recognised, their columns as variables, and what has to be asked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from errormotion import plugins
+from errormotion.datasets.files.tomlfile import nearest
+from errormotion.datasets.maps.columns import Content, contents
+from errormotion.datasets.maps.content import map_of
+from errormotion.datasets.maps.fit import Fit, fit, further
+from errormotion.datasets.maps.questions import Choice, Question, questions_of
+from errormotion.datasets.maps.reading import kind_of
+from errormotion.datasets.schemas import RawSchema, raw_schemas
+from errormotion.datasets.tables.format import Format
+from errormotion.datasets.tables.reading import read_tables
+from errormotion.datasets.tables.table import Table
+from errormotion.errors import DatasetError
+
+__all__ = ["Choice", "Preview", "Proposal", "Question", "propose"]
+
+_ROWS = 8
+"""Number of rows of a preview."""
+_NONE: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class Preview:
+    """A table as it was recognised.
+
+    Attributes
+    ----------
+    path : Path
+    sheet : str
+        Sheet of a spreadsheet; empty for other files.
+    titles, units, meanings : tuple of str
+        Of each column; empty for no unit in the file, and for a column that is not used.
+    rows : tuple of tuple of str
+        The first rows.
+    count : int
+        Number of rows.
+    format : mapping of str to str
+        What was recognised: encoding, delimiter, decimal sign.
+    notes : tuple of str
+    """
+
+    path: Path
+    sheet: str
+    titles: tuple[str, ...]
+    units: tuple[str, ...]
+    meanings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    count: int
+    format: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A proposed map.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+    schema, variant : str
+        Raw schema of the dataset; empty if none fits.
+    candidates : tuple of Choice
+        Schemas that fit, the best first.
+    tables : tuple of Preview
+    map : mapping
+        ``errormotion.map/2`` as data, with all proposals and answers.
+    questions : tuple of Question
+        Those without an answer, in the order in which to ask them.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    paths: tuple[Path, ...]
+    schema: str
+    variant: str
+    candidates: tuple[Choice, ...]
+    tables: tuple[Preview, ...]
+    map: Mapping[str, Any]
+    questions: tuple[Question, ...]
+    notes: tuple[str, ...]
+    _state: _State = field(repr=False)
+
+    @property
+    def open(self) -> tuple[Question, ...]:
+        """The questions without whose answers nothing can be imported, and for which nothing can be proposed."""
+        return tuple(each for each in self.questions if each.needed and not each.proposed)
+
+    @property
+    def raw(self) -> RawSchema | None:
+        """The raw schema."""
+        return self._state.chosen
+
+    def answered(self, answers: Mapping[str, str]) -> Proposal:
+        """Return the proposal with further answers, by the keys of the questions.
+
+        Raises
+        ------
+        DatasetError
+            An answer is none of the choices, or no value of its kind; there is no such key.
+        """
+        return _proposal(replace(self._state, answers={**self._state.answers, **answers}), set(answers))
+
+
+@dataclass(frozen=True)
+class _State:
+    paths: tuple[Path, ...]
+    schemas: tuple[RawSchema, ...]
+    answers: Mapping[str, str]
+    columns: tuple[tuple[Content, ...], ...] = ()
+    form: Mapping[str, str] = field(default_factory=dict)
+    chosen: RawSchema | None = None
+
+
+def propose(
+    paths: Sequence[Path], schemas: Sequence[RawSchema] = (), *, answers: Mapping[str, str] = _NONE
+) -> Proposal:
+    """Return a proposed map of files.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        The files of one dataset.
+    schemas : sequence of RawSchema, optional
+        Schemas that the dataset may have; default: those of all plugins.
+    answers : mapping of str to str, optional
+        Answers that are known, by the keys of questions, such as ``values.bar_radius``. Those to questions of other
+        schemas are ignored.
+
+    Raises
+    ------
+    DatasetError
+        A file cannot be read, or has no table of numbers; an answer is wrong.
+    """
+    if not paths:
+        raise DatasetError("expected files; found none", code="map.files")
+    state = _State(tuple(map(Path, paths)), tuple(schemas) or raw_schemas(), dict(answers))
+    return _proposal(state, set())
+
+
+def _proposal(state: _State, new: set[str]) -> Proposal:
+    form = {key.partition(".")[2]: text for key, text in state.answers.items() if key.startswith("format.") and text}
+    if not state.columns or form != state.form:
+        try:
+            tables = [table for path in state.paths for table in _tables(path, form)]
+        except DatasetError as error:
+            if error.code != "file.numbers.ambiguous" or "decimal" in form:
+                raise
+            return _unreadable(state, error)
+        state = replace(state, columns=tuple(tuple(contents(table)) for table in tables), form=form)
+    fits = _fits(state)
+    candidates = tuple(Choice(each.raw.title, _described(each.raw)) for each, _ in fits)
+    wanted = state.answers.get("raw", "")
+    if wanted and wanted not in {each.value for each in candidates}:
+        known = {each.value for each in candidates}
+        raise DatasetError(f"raw: expected a schema that fits the file; {nearest(wanted, known)}", code="map.answer")
+    previews = [_preview(columns, []) for columns in state.columns]
+    if not fits:
+        note = (
+            "the columns fit no raw schema: "
+            + "; ".join(", ".join(repr(title) for title in each.titles) for each in previews)[:300]
+        )
+        return Proposal(state.paths, "", "", (), tuple(previews), {}, (), (note,), state)
+    chosen, main = next(((each, k) for each, k in fits if each.raw.title == wanted), fits[0])
+    state = replace(state, chosen=chosen.raw)
+    parts = _parts(state, chosen, main)
+    questions = questions_of(parts, state.answers, new, _above(state))
+    if len(fits) > 1 and not wanted:
+        clear = fits[0][0].score - fits[1][0].score >= _MARGIN
+        proposed = candidates[0].value if clear else ""
+        questions = [Question("raw", "Which kind of measurement is this?", candidates, proposed, True), *questions]
+    _refuse_unknown(new, questions, parts)
+    tables = [parts[0].columns[0].column.table, *(each.columns[0].column.table for each in parts[1:])]
+    content = map_of(parts, state.answers, questions, kind_of(tables), form)
+    by_table = {id(each.columns[0].column.table): each for each in parts}
+    previews = []
+    notes = []
+    for columns in state.columns:
+        part = by_table.get(id(columns[0].table))
+        previews.append(_preview(columns, part.meanings(len(columns[0].table.titles)) if part else []))
+        if part is None:
+            table = columns[0].table
+            where = f"sheet '{table.form.sheet}' of " if table.form.sheet else ""
+            notes.append(f"{where}{table.path.name} is not used: its columns fit no variable that is missing")
+    for each in previews:
+        unused = [title for title, meaning in zip(each.titles, each.meanings, strict=True) if not meaning and title]
+        if unused and any(each.meanings):
+            notes.append(f"columns that are not used: {', '.join(unused)}")
+    variant = chosen.raw.variant
+    return Proposal(
+        state.paths, chosen.raw.id, variant, candidates, tuple(previews), content, tuple(questions), tuple(notes), state
+    )
+
+
+_FAR = 4.0
+"""Difference of the scores from which a schema is not offered."""
+_MARGIN = 0.5
+"""Smallest difference of the scores with which the better one of two schemas is proposed."""
+
+
+def _described(raw: RawSchema) -> str:
+    """Return what a schema is for: the summary of its plugin, and the variant."""
+    owner = plugins.owner_of_schema(raw.id)
+    summary = owner.info.summary if owner is not None else raw.id
+    return f"{summary}: {raw.variant}" if raw.variant else summary
+
+
+def _tables(path: Path, form: Mapping[str, str]) -> list[Table]:
+    return read_tables(path, Format.model_validate(dict(form)))
+
+
+def _unreadable(state: _State, error: DatasetError) -> Proposal:
+    """Return the proposal that only asks for the decimal sign."""
+    choices = (Choice(",", "comma: 1,250 is 1.25"), Choice(".", "point: 1,250 is 1250"))
+    text = f"The decimal sign cannot be seen in the numbers ({str(error).partition(': ')[2].partition(';')[0]})."
+    question = Question("format.decimal", text, choices, "", True)
+    return Proposal(state.paths, "", "", (), (), {}, (question,), (), state)
+
+
+def _fits(state: _State) -> list[tuple[Fit, int]]:
+    """Return the schemas that fit one of the tables, and its number, the best first."""
+    found = []
+    for raw in state.schemas:
+        own = [(each, k) for k, columns in enumerate(state.columns) if (each := fit(raw, columns)) is not None]
+        if own:
+            found.append(max(own, key=lambda each: each[0].score))
+    found = sorted(found, key=lambda each: -each[0].score)
+    return [each for each in found if each[0].score > found[0][0].score - _FAR]
+
+
+def _parts(state: _State, chosen: Fit, main: int) -> list[Fit]:
+    """Return the columns of all tables: of the readings, and of those with variables that they lack."""
+    parts = [_corrected(chosen, state.columns[main], state.answers)]
+    there = {each.name for each in chosen.columns} - {"time"}
+    for k, columns in enumerate(state.columns):
+        if k == main:
+            continue
+        wanted = [row.name for row in chosen.raw.rows if row.name not in there and row.name != "time"]
+        more = further(chosen.raw, columns, wanted)
+        if more is not None:
+            parts.append(more)
+            there |= {each.name for each in more.columns} - {"time"}
+            chosen.lacking = [row for row in chosen.lacking if row.name not in there]
+    return parts
+
+
+def _corrected(found: Fit, columns: Sequence[Content], answers: Mapping[str, str]) -> Fit:
+    """Return a fit with the answers to which column has which variable."""
+    for key, text in answers.items():
+        where = key.removeprefix("columns.")
+        own = next((each for each in found.columns if each.key == where), None)
+        if not key.startswith("columns.") or own is None:
+            continue
+        column = next((each for each in columns if text in (each.title, str(each.index + 1))), None)
+        if column is None:
+            continue
+        other = next((each for each in found.columns if each.column.index == column.index), None)
+        if other is not None:
+            other.column = own.column
+        own.column, own.sure = column, True
+    return found
+
+
+def _above(state: _State) -> list[str]:
+    """Return the lines above the tables, and the names of the files without their endings."""
+    lines = [line for columns in state.columns for line in columns[0].table.above]
+    return [*lines, *(re.sub(r"[_\W]+", " ", path.stem) for path in state.paths)]
+
+
+def _refuse_unknown(new: Iterable[str], questions: Sequence[Question], parts: Sequence[Fit]) -> None:
+    """Raise DatasetError for an answer to a key that neither a question nor the schema has."""
+    raw = parts[0].raw
+    rows = {row.name for row in (*raw.rows, *raw.stated)}
+    for key in new:
+        head, _, name = key.partition(".")
+        known = key in ("raw", "machine") or key in {each.key for each in questions}
+        known |= head in ("columns", "units", "values") and name.partition(".")[0] in rows
+        known |= head in ("attributes", "format") and bool(name)
+        if not known:
+            keys = [each.key for each in questions] + [f"values.{each}" for each in rows]
+            raise DatasetError(f"{key}: no such question; {nearest(key, keys)}", code="map.answer")
+
+
+def _preview(columns: Sequence[Content], meanings: Sequence[str]) -> Preview:
+    table = columns[0].table
+    count = len(table.titles)
+    cells = [list(table.cells.texts(k)[:_ROWS]) for k in range(count)]
+    rows = tuple(tuple(column[k] for column in cells) for k in range(min(_ROWS, len(table.lines))))
+    form = {
+        name: value
+        for name in ("encoding", "delimiter", "decimal", "thousands")
+        if (value := getattr(table.form, name)) and value != "auto"
+    }
+    units = tuple([*table.units, *[""] * count][:count])
+    return Preview(
+        table.path,
+        table.form.sheet,
+        tuple(table.titles),
+        units,
+        tuple(meanings) or ("",) * count,
+        rows,
+        len(table.lines),
+        form,
+        tuple(table.notes),
+    )

@@ -1,0 +1,341 @@
+"""What a file does not say, as questions with choices and proposals."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from errormotion.datasets.files.tomltext import value_of
+from errormotion.datasets.maps.columns import DATES, Content
+from errormotion.datasets.maps.fit import Assigned, Fit, label_of
+from errormotion.datasets.maps.units import fitting_unit
+from errormotion.datasets.maps.words import likeness, tokens
+from errormotion.datasets.schemas import POSITION, RawSchema, Row
+from errormotion.datasets.tables.dates import COUNTED, EXCEL, UNIX, UNIX_MS
+from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.text.log_import import read_value
+from errormotion.datasets.text.log_map import MappedValue
+from errormotion.datasets.text.table_reader import Found, Names
+from errormotion.errors import DatasetError
+from errormotion.kinematics.iso import DOF
+
+UNITS = {
+    "m": ("mm", "um", "nm", "m", "inch"),
+    "rad": ("arcsec", "deg", "um/m", "mrad", "urad", "rad"),
+    "s": ("s", "min", "h", "ms", UNIX, UNIX_MS, EXCEL),
+    "1/min": ("/min", "/s"),
+    "degC": ("degC", "degF", "K"),
+    "Pa": ("hPa", "Pa", "kPa"),
+    "m/s": ("mm/min", "m/min", "mm/s", "m/s"),
+    "K": ("K",),
+}
+"""Choices of units, by the unit of the schema."""
+_STATED = re.compile(r"\W*([^:=;\t]{1,40}?)\s*[:=;\t]\s*([+-]?[0-9][0-9.,eE+-]*\s*[^\s;,]{0,8})")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An answer: ``value`` as it stands in the map, and ``text`` for people."""
+
+    value: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a file does not say.
+
+    Attributes
+    ----------
+    key : str
+        Key of the map that the answer sets, such as ``units.distance``.
+    text : str
+        One sentence.
+    choices : tuple of Choice
+        None: a free text, such as ``5 mm``.
+    proposed : str
+        What is taken without a person; empty if nothing can be proposed.
+    needed : bool
+        Whether there is no dataset without an answer.
+    """
+
+    key: str
+    text: str
+    choices: tuple[Choice, ...]
+    proposed: str
+    needed: bool
+
+
+def questions_of(
+    parts: Sequence[Fit], answers: Mapping[str, str], new: set[str], above: Sequence[str]
+) -> list[Question]:
+    """Return the questions that the columns of all parts leave open, without those that are answered.
+
+    Parameters
+    ----------
+    parts : sequence of Fit
+        The readings first.
+    answers : mapping of str to str
+        By key.
+    new : set of str
+        Keys of the answers that are to be checked.
+    above : sequence of str
+        Lines above the tables, and names of files, in which values may stand.
+
+    Raises
+    ------
+    DatasetError
+        An answer is wrong.
+    """
+    main = parts[0]
+    found = [*_columns(main), *_attributes(main, above, answers)]
+    axis = answers.get("attributes.axis") or next((q.proposed for q in found if q.key == "attributes.axis"), "")
+    found += _freedoms(parts, axis)
+    for part in parts:
+        found += [question for question in _units(part, answers) if question.key not in {each.key for each in found}]
+    found += _values(main, above)
+    found.append(Question("machine", "Name of the machine", (), _machine(above), False))
+    for question in found:
+        if question.key in new:
+            _check(question, answers[question.key], main)
+    rows = {row.name for row in (*main.raw.rows, *main.raw.stated)}
+    for key in new - {each.key for each in found}:
+        if key.startswith("values.") and key.partition(".")[2] in rows:
+            _check(Question(key, "", (), "", False), answers[key], main)
+    return [each for each in found if each.key not in answers]
+
+
+def _columns(main: Fit) -> list[Question]:
+    """Return the questions for the columns that were assigned by their order."""
+    found = []
+    able = [each.column for each in main.columns if each.column.kind != DATES]
+    choices = tuple(Choice(place_of(column), _shown(column)) for column in able)
+    for each in main.columns:
+        free = each.key.endswith(f".{label_of(each.column)}")
+        if each.sure or each.key.endswith(".?") or each.labels or free:
+            continue
+        text = f"Which column is {each.key.replace('.', ' ')}?"
+        found.append(Question(f"columns.{each.key}", text, choices, place_of(each.column), True))
+    return found
+
+
+def place_of(column: Content) -> str:
+    """Return the name of a column, or its number where that is not unique."""
+    titles = column.table.titles
+    if column.table.form.header is False or titles.count(column.title) != 1 or not column.title:
+        return str(column.index + 1)
+    return column.title
+
+
+def _shown(column: Content) -> str:
+    first = next((text for text in column.texts if text), "")
+    return f"{column.title} ({first}, ...)"
+
+
+def _attributes(main: Fit, above: Sequence[str], answers: Mapping[str, str]) -> list[Question]:
+    found = []
+    for name, allowed in main.raw.attributes.items():
+        proposed = _attribute(name, allowed, main, above) if not answers.get(f"attributes.{name}") else ""
+        choices = tuple(Choice(each, each) for each in allowed)
+        found.append(Question(f"attributes.{name}", f"Which {name} was measured?", choices, proposed, True))
+    return found
+
+
+def _attribute(name: str, allowed: Sequence[str], main: Fit, above: Sequence[str]) -> str:
+    """Return the value of an attribute that a freedom, a title or a line of the file states; empty if none does."""
+    words = {name.lower(), *(("achse", "axis") if name == "axis" else ())}
+    found = [each.key[-1] for each in main.columns if re.search(r"\.E[XYZABC][XYZABC]$", each.key)]
+    for text in (*above, *(each.column.title for each in main.columns)):
+        own = tokens(text)
+        for value in allowed:
+            sign = value.lower()
+            forms = [form for word in words for form in ((word, sign), (sign, word), (sign, "-", word))]
+            beside = any(own[k : k + len(form)] == form for k in range(len(own)) for form in forms)
+            joined = any(token in (sign + word, word + sign) for token in own for word in words)
+            if beside or joined:
+                found.append(value)
+    known = [value for value in dict.fromkeys(found) if value in allowed]
+    return known[0] if len(known) == 1 else ""
+
+
+def _freedoms(parts: Sequence[Fit], axis: str) -> list[Question]:
+    """Return the question which error a deviation is, where its title does not state it."""
+    for part in parts:
+        each = next((each for each in part.columns if each.key.endswith(".?")), None)
+        if each is None:
+            continue
+        row = next(row for row in part.raw.rows if row.name == each.name)
+        lengths, angles = (bool(fitting_unit(each.column.unit, row, kind)) for kind in ("EX", "EA"))
+        letter = axis or "X"
+        dofs = [dof for dof in DOF if not each.column.unit or (lengths if dof[1] in "XYZ" else angles)]
+        own = f"E{letter}{letter}"
+        proposed = own if axis in tuple("XYZ") and own[:2] in dofs else ""
+        text = {"EX": "displacement along X", "EY": "displacement along Y", "EZ": "displacement along Z"}
+        text |= {"EA": "rotation about X", "EB": "rotation about Y", "EC": "rotation about Z"}
+        choices = tuple(Choice(dof + letter, f"{dof}{letter}: {text[dof]}") for dof in dofs)
+        ask = f"Which error is in column '{each.column.title}'?"
+        return [Question(f"columns.{each.name}", ask, choices, proposed, True)]
+    return []
+
+
+def _units(part: Fit, answers: Mapping[str, str]) -> list[Question]:
+    found: dict[str, Question] = {}
+    for each in part.columns:
+        row = next(row for row in part.raw.rows if row.name == each.name)
+        key = f"units.{each.name}"
+        if key in found or each.column.table.units is None:
+            continue
+        title = f"column '{each.column.title}'"
+        if each.column.kind == DATES:
+            if len(each.column.dates) > 1:
+                first = next(text for text in each.column.texts if text)
+                choices = tuple(Choice(unit, f"{unit}: {_read(first, unit)}") for unit in each.column.dates)
+                text = f"What is the order of day and month in {title}, such as {first}?"
+                found[key] = Question(key, text, choices, _order(each.column), True)
+            continue
+        if row.unit in ("", "1") and not row.units:
+            continue
+        freedom = _freedom(each, answers)
+        if each.column.unit_for(row, freedom):
+            continue
+        kinds = row.units or (row.unit,)
+        if freedom[:2] in DOF:
+            kinds = ("m",) if freedom[1] in "XYZ" else ("rad",)
+        units = [unit for kind in kinds for unit in UNITS.get(kind, (kind,))]
+        choices = tuple(Choice(unit, _in(each.column, unit)) for unit in units)
+        found[key] = Question(key, f"Which unit has {title}?", choices, _unit(each.column, row), True)
+    return list(found.values())
+
+
+def _freedom(each: Assigned, answers: Mapping[str, str]) -> str:
+    _, _, label = each.key.partition(".")
+    return answers.get(f"columns.{each.name}", "") if label == "?" else label
+
+
+def _read(text: str, unit: str) -> str:
+    from errormotion.datasets.tables.dates import Clock
+
+    clock = Clock(unit)
+    clock.seconds(text)
+    return clock.start.strftime("%d %B %Y") if clock.start else text
+
+
+def _order(column: Content) -> str:
+    """Return the order of day and month with which the times of a column increase in short steps; empty for both."""
+    from errormotion.datasets.tables.dates import Clock
+
+    if all("." in unit for unit in column.dates):
+        return column.dates[0]
+    able = []
+    for unit in column.dates:
+        clock = Clock(unit, repeats=True)
+        seconds = np.array([clock.seconds(text) for text in column.texts[:2000] if text])
+        steps = np.diff(seconds)
+        if (steps >= 0).all() and (not steps.size or steps.max() < 20 * 86400):
+            able.append(unit)
+    return able[0] if len(able) == 1 else ""
+
+
+def _in(column: Content, unit: str) -> str:
+    if unit in COUNTED:
+        return unit
+    known = column.values[~np.isnan(column.values)]
+    return f"{unit}: up to {np.abs(known).max():.6g} {unit}" if known.size else unit
+
+
+def _unit(column: Content, row: Row) -> str:
+    """Return the only plausible unit of numbers; empty if there are several."""
+    known = column.values[~np.isnan(column.values)]
+    if not known.size:
+        return ""
+    low, high = float(known.min()), float(known.max())
+    if row.unit == "degC":
+        return "degC" if low > -60 and high < 90 else ""
+    if row.unit == "m" and (row.low, row.high) == POSITION:
+        return "mm" if 10 <= max(-low, high) <= 20000 else ""
+    if row.unit == "s":
+        year = {EXCEL: (36526, 73050), UNIX: (9.4e8, 4.2e9), UNIX_MS: (9.4e11, 4.2e12)}
+        return next((unit for unit, (first, last) in year.items() if first < low and high < last), "")
+    if row.unit == "1/min":
+        return "/min"
+    return ""
+
+
+def _values(main: Fit, above: Sequence[str]) -> list[Question]:
+    found = []
+    rows = [*main.lacking, *(row for row in main.raw.rows if row.name in main.raw.asked)]
+    assigned = {each.name for each in main.columns}
+    for row in rows:
+        if row.name in assigned:
+            continue
+        unit = f", with its unit, such as {_example(row, main.raw)}" if row.unit not in ("", "1") else ""
+        dims = f" ({', '.join(row.dims)})" if row.dims else ""
+        text = f"{row.name}{dims}: {row.meaning}{unit}"
+        found.append(Question(f"values.{row.name}", text, (), _stated(row, above), row.required))
+    return found
+
+
+def _example(row: Row, raw: RawSchema) -> str:
+    unit = UNITS.get(row.unit, (row.unit,))[0]
+    if not row.dims:
+        return f"'{0.3 if row.high <= 1e-3 else 5} {'um' if unit == 'mm' and row.high <= 1e-3 else unit}'"
+    counts = [len(raw.labels.get(dim, ())) or raw.sizes.get(dim, 2) for dim in row.dims]
+    each = " ".join("0" for _ in range(counts[-1])) + f" {unit}"
+    return f"'{each}'" if len(counts) == 1 else "[" + ", ".join([f"'{each}'"] * min(counts[0], 5)) + "]"
+
+
+def _stated(row: Row, above: Sequence[str]) -> str:
+    """Return the value of a variable with its unit in the lines above the table; empty if there is none."""
+    if row.dims or row.unit in ("", "1"):
+        return ""
+    for line in above:
+        match = _STATED.match(line)
+        if match and likeness(match[1], row.name) >= 2.0:
+            text = match[2].replace(",", ".")
+            number = re.match(r"[+-]?[0-9.eE+-]*[0-9.]", text)
+            unit = fitting_unit(text[number.end() :].strip(), row) if number else ""
+            if number and unit:
+                return f"{number[0]} {unit}"
+    return ""
+
+
+def _machine(above: Sequence[str]) -> str:
+    for line in above:
+        match = re.match(r"\W*(?:machine|maschine)(?:\s*name)?\s*[:=;\t]\s*([^;\t\"]{1,60})", line, re.IGNORECASE)
+        if match:
+            return match[1].strip()
+    return ""
+
+
+def _check(question: Question, answer: str, main: Fit) -> None:
+    """Raise DatasetError if an answer is none of the choices, or no value of its kind."""
+    if not answer and not question.needed:
+        return
+    raw = main.raw
+    if question.key.startswith("values."):
+        name = question.key.partition(".")[2]
+        table = main.columns[0].column.table
+        mistakes = Mistakes(table.path)
+        names = Names.of([raw])
+        rows = {**{row.name: row for row in raw.stated}, **names.rows}
+        value = value_of(answer)
+        entry = MappedValue.model_validate(value if isinstance(value, dict) else {"value": value})
+        read_value(name, entry, table, replace(names, rows=rows), Found(), mistakes)
+        if mistakes.count:
+            raise DatasetError(f"{question.key}: {mistakes.first.removeprefix(f'values.{name}: ')}", code="map.answer")
+        return
+    values = [choice.value for choice in question.choices]
+    if question.key.startswith("units."):
+        usual = [*values]
+        row = next(row for row in raw.rows if row.name == question.key.partition(".")[2].partition(".")[0])
+        if answer in usual or fitting_unit(answer, row):
+            return
+    elif not values or answer in values:
+        return
+    raise DatasetError(
+        f"{question.key}: expected {'one of ' + ', '.join(values) if values else 'an answer'}; found '{answer}'",
+        code="map.answer",
+    )

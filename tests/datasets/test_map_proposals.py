@@ -1,0 +1,199 @@
+"""Proposed maps: what is recognised of files of laboratories, what is asked, and that the written map reads them."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from errormotion.datasets.importing import import_files
+from errormotion.datasets.maps.known import known_map
+from errormotion.datasets.maps.proposal import Proposal, propose
+from errormotion.datasets.maps.writing import text_of, write_map
+from errormotion.errors import DatasetError
+
+BEAMS = {
+    "values.beam_origin": '["6 0 10 mm", "6 0 50 mm", "0 6 10 mm", "0 6 50 mm", "0 0 -1 mm"]',
+    "values.beam_direction": "[[-1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]]",
+    "values.bar_radius": "5 mm",
+    "values.distance_noise": "0.3 um",
+    "values.level": '["10 mm", "50 mm"]',
+}
+SPINDLE = "Maschine: M7\n\nZeit [s];X1 [µm];X2 [µm];Y1 [µm];Y2 [µm];Z [µm];T Rahmen [°C]\n" + "".join(
+    f"{30 * k};1000,{k};1000;1001;1002;1003;20,{k}\n" for k in range(9)
+)
+SENSORS = "t;Sensor 1;Sensor 2;Sensor 3;Sensor 4;Sensor 5\n" + "".join(
+    f"{30 * k};1000,{k};1000;1001;1002;1003\n" for k in range(9)
+)
+BACK_AND_FORTH = [0, 100, 200, 200, 100, 0] * 2
+POSITIONING = "Position [mm];Abweichung [µm]\n" + "".join(f"{p};{k % 5},5\n" for k, p in enumerate(BACK_AND_FORTH))
+DIFFERENCES = "Nr;Soll [mm];Ist [mm]\n" + "".join(f"{k + 1};{p};{p},000{k % 5}\n" for k, p in enumerate(BACK_AND_FORTH))
+MATRIX = "Target [mm];1+ [um];1- [um];2+ [um];2- [um]\n" + "".join(f"{p};0,1;0,2;0,3;0,4\n" for p in (0, 100, 200))
+LONG = "Lauf;Richtung;Position [mm];EXX [µm];EBX [arcsec]\n" + "".join(
+    f"{run};{way};{p};1,5;0,5\n" for run in (1, 2) for way in "+-" for p in (0, 100, 200)
+)
+PT100 = (
+    "Datum;Zeit;"
+    + ";".join(f"T{k}" for k in range(1, 9))
+    + "\n"
+    + "".join(
+        f"{4 + h // 24:02d}.05.2026;{h % 24:02d}:30:00;" + ";".join(f"2{k},{h % 10}" for k in range(8)) + "\n"
+        for h in range(30)
+    )
+)
+TRACKER = "Tracker 3.1\nLength noise: 0.5 um\nStation\tPunkt\tX [mm]\tY [mm]\tZ [mm]\tDistanz [mm]\n" + "".join(
+    f"S{s}\tP{p}\t{p * 10}\t{p % 7 * 5}\t{p % 5 * 9}\t{1000 + p + s * 3.1:.4f}\n" for s in range(4) for p in range(60)
+)
+WIDE = "Punkt;X [mm];Y [mm];Z [mm];S1 [mm];S2 [mm];S3 [mm]\n" + "".join(
+    f"P{p};{p * 10};{p % 7 * 5};{p % 5 * 9};1000,1;1100,2;{900 + p}\n" for p in range(20)
+)
+BALLS = "cycle;time [s];ball;x [mm];y [mm];z [mm]\n" + "".join(
+    f"{c};{c * 60};{b};{b * 100},001;{b * 50},1;0\n" for c in range(3) for b in range(4)
+)
+TABLE = "Winkel [deg];Kugel;S1 [um];S2 [um];S3 [um]\n" + "".join(
+    f"{a};{b};1;2;3\n" for a in range(0, 360, 30) for b in (1, 2)
+)
+NESTS = {
+    "attributes.axis": "C",
+    "values.sphere_position": '["0 0 1 mm", "0 1 100 mm"]',
+    "values.sensor_direction": "[[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
+    "values.axis_point": "0 0 0 mm",
+    "values.sensor_direction_uncertainty": "1 mrad",
+    "values.gain_uncertainty": "0.001",
+}
+X = {"attributes.axis": "X"}
+UNITS = {"units.time": "s", "units.distance": "um"}
+FILES = [
+    ("spindle", SPINDLE, BEAMS, "spindle_drift", {"channel": 5, "time": 9, "sensor": 1}),
+    ("sensors", SENSORS, BEAMS | UNITS, "spindle_drift", {"channel": 5, "time": 9}),
+    ("as measured", POSITIONING, X, "linear_positioning", {"run": 2, "approach": 2, "target": 3, "freedom": 1}),
+    ("differences", DIFFERENCES, X, "linear_positioning", {"run": 2, "approach": 2, "target": 3, "freedom": 1}),
+    ("matrix", MATRIX, X, "linear_positioning", {"run": 2, "approach": 2, "target": 3, "freedom": 1}),
+    ("long", LONG, {}, "linear_positioning", {"run": 2, "approach": 2, "target": 3, "freedom": 2}),
+    ("thermometers", PT100, {}, "monitor", {"time": 30, "sensor": 8}),
+    ("tracker", TRACKER, {"values.displacement_noise": "0.5 um"}, "multilateration", {"station": 4, "target": 60}),
+    ("stations", WIDE, {"values.displacement_noise": "0.5 um"}, "multilateration", {"station": 3, "target": 20}),
+    ("balls", BALLS, {}, "normal_vector", {"time": 3, "ball": 4}),
+    ("rotary table", TABLE, NESTS, "r_test", {"angle": 12, "sphere": 2, "sensor": 3}),
+]  # fmt: skip
+
+
+def file_of(tmp_path: Path, text: str, name: str = "file.csv") -> Path:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def accepted(proposal: Proposal, answers: Mapping[str, str]) -> Proposal:
+    """Return a proposal with these answers, and what is proposed for all other questions."""
+    while proposal.questions:
+        question = proposal.questions[0]
+        answer = answers.get(question.key, question.proposed)
+        assert answer or not question.needed, question
+        proposal = proposal.answered({question.key: answer})
+    return proposal
+
+
+@pytest.mark.parametrize(
+    ("text", "answers", "method", "sizes"), [case[1:] for case in FILES], ids=[case[0] for case in FILES]
+)
+def test_the_proposed_map_reads_the_file(tmp_path, text: str, answers: Mapping[str, str], method: str, sizes) -> None:
+    file = file_of(tmp_path, text)
+    proposal = accepted(propose([file]), answers)
+    assert proposal.schema == f"errormotion.raw.{method}/1"
+    write_map(proposal, tmp_path / "map.toml")
+    raw = import_files([file], tmp_path / "map.toml")
+    assert {dim: raw.sizes[dim] for dim in sizes} == sizes
+    assert known_map([file], [tmp_path / "map.toml"]) == tmp_path / "map.toml"
+    lines = [
+        line for line in (tmp_path / "map.toml").read_text("utf-8").splitlines() if line and not line.startswith("#")
+    ]
+    assert len(lines) <= 22
+
+
+def test_a_second_file_of_the_same_kind_has_the_same_map(tmp_path) -> None:
+    proposal = accepted(propose([file_of(tmp_path, SPINDLE)]), BEAMS)
+    write_map(proposal, tmp_path / "map.toml")
+    second = file_of(tmp_path, SPINDLE.replace("1000,1", "1000,7"), "second.csv")
+    other = file_of(tmp_path, SPINDLE.replace("X1 [µm]", "X1 [mm]"), "other.csv")
+    assert known_map([second], [tmp_path / "map.toml"]) == tmp_path / "map.toml"
+    assert known_map([other], [tmp_path / "map.toml"]) is None
+    raw = import_files([second], tmp_path / "map.toml")
+    assert float(raw["distance"].sel(channel="X1")[1]) == pytest.approx(1000.7e-6)
+
+
+def test_the_order_of_dates_that_cannot_be_known_is_asked(tmp_path) -> None:
+    log = "Date,T1 [C],T2 [C]\n" + "".join(f"03/04/2026 10:0{k}:00,20.{k},21\n" for k in range(9))
+    proposal = propose([file_of(tmp_path, log)])
+    (question,) = proposal.open
+    assert question.key == "units.time"
+    assert {choice.value for choice in question.choices} == {"mm/dd/yyyy", "dd/mm/yyyy"}
+    shown = {choice.value: choice.text for choice in question.choices}
+    assert shown["dd/mm/yyyy"] == "dd/mm/yyyy: 03 April 2026"
+    assert propose([file_of(tmp_path, log)]).answered({"units.time": "dd/mm/yyyy"}).map["units"]["time"] == "dd/mm/yyyy"
+
+
+@pytest.mark.parametrize(("later", "order"), [("04/04/2026", "dd/mm/yyyy"), ("03/05/2026", "mm/dd/yyyy")])
+def test_the_order_of_dates_is_proposed_where_one_makes_the_times_dense(tmp_path, later: str, order: str) -> None:
+    log = "Date,T1 [C]\n03/04/2026 22:00:00,20\n" + f"{later} 06:00:00,21\n{later} 07:00:00,21\n"
+    (question, _) = propose([file_of(tmp_path, log)]).questions
+    assert question.proposed == order
+
+
+def test_an_unknown_unit_is_asked_and_not_guessed(tmp_path) -> None:
+    proposal = propose([file_of(tmp_path, SENSORS)], answers=BEAMS)
+    assert {question.key for question in proposal.open} == {"units.time", "units.distance"}
+    with pytest.raises(DatasetError, match=r"units.distance: expected one of mm, um, nm, m, inch; found 'V'"):
+        proposal.answered({"units.distance": "V"})
+
+
+def test_columns_in_their_order_are_asked_and_can_be_exchanged(tmp_path) -> None:
+    proposal = propose([file_of(tmp_path, SENSORS)], answers=BEAMS)
+    asked = {question.key: question.proposed for question in proposal.questions if question.key.startswith("columns")}
+    assert asked["columns.distance.X1"] == "Sensor 1"
+    found = proposal.answered({"columns.distance.X1": "Sensor 3"}).map["columns"]["distance"]
+    assert found == {"X1": "Sensor 3", "X2": "Sensor 2", "Y1": "Sensor 1", "Y2": "Sensor 4", "Z": "Sensor 5"}
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ({"values.bar_radius": "5"}, "values.bar_radius: expected a unit"),
+        ({"values.bar_radius": "5 s"}, "values.bar_radius: expected a unit of the kind of m"),
+        ({"values.bar_radius": "5 m"}, "values.bar_radius: makes bar_radius = 5 m; expected 0.0005..0.1 m"),
+        ({"values.bar": "5 mm"}, "values.bar: no such question; did you mean 'values.bar_radius'"),
+        ({"raw": "errormotion.raw.r_test/1"}, "raw: expected a schema that fits the file"),
+    ],
+)
+def test_a_wrong_answer_is_refused_with_its_key(tmp_path, answers, message: str) -> None:
+    with pytest.raises(DatasetError, match=message):
+        propose([file_of(tmp_path, SPINDLE)]).answered(answers)
+
+
+def test_values_at_the_top_of_a_file_are_proposed(tmp_path) -> None:
+    proposed = {question.key: question.proposed for question in propose([file_of(tmp_path, TRACKER)]).questions}
+    assert proposed["values.displacement_noise"] == "0.5 um"
+    assert {q.key: q.proposed for q in propose([file_of(tmp_path, SPINDLE)]).questions}["machine"] == "M7"
+
+
+def test_temperatures_of_a_second_file_belong_to_the_readings(tmp_path) -> None:
+    warm = file_of(tmp_path, "Zeit [s];T Rahmen [°C];T Bett [°C]\n0;20,5;21\n600;20,9;21\n", "warm.csv")
+    log = file_of(
+        tmp_path, "\n".join(line.rpartition(";")[0] or line for line in SPINDLE.splitlines()) + "\n", "log.csv"
+    )
+    proposal = accepted(propose([log, warm]), BEAMS)
+    write_map(proposal, tmp_path / "map.toml")
+    raw = import_files([log, warm], tmp_path / "map.toml")
+    np.testing.assert_allclose(raw["temperature"].sel(sensor="T Rahmen"), 20.5 + 0.4 * np.arange(9) * 30 / 600)
+
+
+def test_open_questions_stand_in_the_written_map(tmp_path) -> None:
+    text = text_of(propose([file_of(tmp_path, SENSORS)]))
+    assert "# TO STATE units.distance: Which unit has column 'Sensor 1'? One of mm, um, nm, m, inch" in text
+    assert "# bar_radius =   # needed: radius of the bar at the side beams, m" in text
+
+
+def test_a_file_of_no_schema_says_which_columns_it_has(tmp_path) -> None:
+    proposal = propose([file_of(tmp_path, "a;b\n1;2\n2;5\n3;3\n")])
+    assert not proposal.schema
+    assert "'a', 'b'" in proposal.notes[0]
