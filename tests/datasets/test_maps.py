@@ -33,6 +33,11 @@ TRACKER = (
 )
 
 
+def with_(text: str) -> str:
+    """Return the map of a drift with further keys before its columns."""
+    return DRIFT.replace("[columns]", text + "[columns]")
+
+
 @pytest.fixture
 def imported(tmp_path: Path):
     def run(text: str, **files: str | bytes):
@@ -115,7 +120,7 @@ def test_a_log_of_temperatures_needs_no_other_column(imported) -> None:
 
 
 def test_temperatures_of_another_file_are_interpolated_to_the_readings(imported) -> None:
-    text = DRIFT.replace("[columns]", 'file = "log*"\n[columns]')
+    text = with_('file = "log*"\n')
     text += '[[tables]]\nfile = "warm*"\n[tables.columns]\ntime = "t"\ntemperature = {frame = "T"}\n'
     raw = imported(text, warm="t [s],T [degC]\n20,20\n40,22\n", log=LOG)
     np.testing.assert_allclose(raw["temperature"].squeeze(), [np.nan, 21.0, np.nan])
@@ -135,7 +140,7 @@ def test_dates_in_one_file_only_are_refused(imported) -> None:
 WRONG = [
     ("an unknown key", DRIFT + "[colums]\n", LOG, "colums: unknown key; did you mean 'columns'"),
     ("an unknown variable", DRIFT.replace("distance =", "distanc ="), LOG, "columns.distanc.*: unknown variable"),
-    ("a unit of no column", DRIFT.replace("[columns]", "[units]\nlength = 'mm'\n[columns]"), LOG, "'length' has no column"),
+    ("a unit of no column", with_("[units]\nlength = 'mm'\n"), LOG, "'length' has no column"),
     ("too few columns", DRIFT.replace('"d", "e"', '"d"'), LOG, r"expected 5 columns \(X1 X2 Y1 Y2 Z\); found 4"),
     ("no unit", DRIFT, LOG.replace("a [um]", "a"), "units.distance.X1: log.csv states no unit for column 'a'"),
     ("another unit", DRIFT, LOG.replace("a [um]", "a [V]"), "expected a unit of the kind of m; found 'V'"),
@@ -144,8 +149,8 @@ WRONG = [
         "\n30,", "\n03/04/2026 10:01:00,").replace("\n60,", "\n03/04/2026 10:02:00,"),
      "units.time: the order of dates such as '03/04/2026 10:00:00'.*'mm/dd/yyyy' or 'dd/mm/yyyy'"),
     ("another schema", DRIFT.replace("spindle_drift/1", "spindel_drift/1"), LOG, "raw: expected a raw schema"),
-    ("another variant", DRIFT.replace("[columns]", 'variant = "drft"\n[columns]'), LOG, "variant: did you mean 'drift'"),
-    ("no file of a pattern", DRIFT.replace("[columns]", 'file = "warm*"\n[columns]'), LOG, "expected one file with a name like"),
+    ("another variant", with_('variant = "drft"\n'), LOG, "variant: did you mean 'drift'"),
+    ("no file of a pattern", with_('file = "warm*"\n'), LOG, "expected one file with a name like"),
 ]  # fmt: skip
 
 
