@@ -58,6 +58,7 @@ class Row:
     unit: str
     verdict: str
     status: str
+    imported: bool = False
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,18 @@ def _row(key: str, entry: Entry) -> Row:
         name, texts = entry.figures[0].name, figure_text(entry.figures[0])
         if not math.isfinite(entry.figures[0].value):
             texts = (DASH, DASH, texts[2])
-    return Row(key, started, entry.machine, entry.test, entry.method, name, *texts, entry.verdict, entry.state)
+    return Row(
+        key,
+        started,
+        entry.machine,
+        entry.test,
+        entry.method,
+        name,
+        *texts,
+        entry.verdict,
+        entry.status,
+        bool(entry.imported),
+    )
 
 
 def _fits(entry: Entry, choice: Choice) -> bool:

@@ -42,6 +42,7 @@ name = "c"
         (("test", 1, "settings", "layout", "rate"), "2 kHz", "# tail", 'layout.rate = "2 kHz"\n# tail'),
         (("test", 2, "settings", "steps"), 3, 'name = "c"\n', 'name = "c"\n[test.settings]\nsteps = 3\n'),
         (("test", 2, "settings", "steps"), None, "", ""),
+        (("tables", "a b", "c"), 1, 'name = "c"\n', 'name = "c"\n[tables."a b"]\nc = 1\n'),
     ],
 )
 def test_one_value_is_changed_and_nothing_else(place: tuple[Any, ...], content: Any, old: str, new: str) -> None:

@@ -155,10 +155,12 @@ def _changed(text: str, place: tuple[Key, ...], content: Any, expected: Any) -> 
     table = beside[-1].table if beside else place[:-1]  # another one if the keys beside it are dotted
     line = f"{'.'.join(key(str(name)) for name in place[len(table) :])} = {value(content)}\n"
     own = beside or [each for each in found if each.table == table]
+    first = 0
     if not own and table:
         own = [each for each in found if each.table[: len(table) - 1] == table[:-1]]
         line = f"[{'.'.join(key(name) for name in table if isinstance(name, str))}]\n{line}"
-    at = own[-1].end if own else 0
+        first = len(text)  # keys above would belong to the table
+    at = own[-1].end if own else first
     lead = "" if at == 0 or text[at - 1 : at] == "\n" else "\n"
     return text[:at] + lead + line + text[at:]
 
