@@ -297,12 +297,12 @@ def _at(name: str, ds: xr.Dataset, point: Array) -> xr.Dataset:
 
 def _check_rotations(datasets: Mapping[str, xr.Dataset], freedoms: Sequence[str]) -> None:
     """Raise DatasetError for rotations of different bodies: of the tool, and of the frame of the axes."""
-    turns = [name for name in freedoms if name in DOF[3:]]
+    angles = [name for name in freedoms if name in DOF[3:]]
     levers = {name: str(ds.attrs.get("lever_axes", "XYZ")) for name, ds in datasets.items()}
-    if turns and len(set(levers.values())) > 1:
+    if angles and len(set(levers.values())) > 1:
         stated = "; ".join(f"'{name}': {axes}" for name, axes in levers.items())
         raise DatasetError(
-            f"The rotations ({', '.join(turns)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
+            f"The rotations ({', '.join(angles)}) are those of different bodies (attribute lever_axes: {stated}): XYZ "
             "means a rigid motion of the tool, fewer axes mean the frame of the axes that carry the tool. Compare the "
             f"displacements: {_displacements(freedoms)}",
             code="compare.bodies.differ",

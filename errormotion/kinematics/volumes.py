@@ -340,11 +340,11 @@ def _normal_equations(
     each term at the targets with known displacements, (6, term).
     """
     d, n, s = targets.error.shape[1], len(terms), len(targets.influence)
-    turns = d == 6 and bool(np.isfinite(targets.error[:, 3:]).any())
-    size, count = n + (9 if turns else 6) + s, 0
+    has_rotations = d == 6 and bool(np.isfinite(targets.error[:, 3:]).any())
+    size, count = n + (9 if has_rotations else 6) + s, 0
     N, b, square = np.zeros((size, size)), np.zeros(size), 0.0
     GG, GA = np.zeros((6, 6)), np.zeros((6, n))
-    use = 6 if turns else 3
+    use = 6 if has_rotations else 3
     for first in range(0, len(targets.position), _BLOCK):
         part = slice(first, first + _BLOCK)
         q, tool, y = targets.position[part], targets.tool[part], targets.error[part, :use]

@@ -55,7 +55,7 @@ def part(ds: xr.Dataset, key: str) -> Part:
         notes.append(Table(f"{len(left_out)} runs left out", ["run and reason"], rows, numeric=False))
     tables: list[Block] = [*_steps(ds), *_events(ds)]
     blocks: list[Section] = [
-        Section("course", "Values over time", [_values_figure(ds, key), *tables]),
+        Section("history", "Values over time", [_values_figure(ds, key), *tables]),
         Section("control", "Control chart", [_chart_figure(ds, key), _ranges_figure(ds, key)]),
         Section("values", "Values", [_values(ds), *notes]),
     ]

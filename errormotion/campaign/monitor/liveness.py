@@ -41,7 +41,7 @@ BLOCKS = 30
 """Last blocks that are evaluated."""
 FEWEST_BLOCKS = 3
 """Blocks without which nothing is decided."""
-FEWEST_VALUES, FEWEST_TURNS = 3, 3
+FEWEST_VALUES, FEWEST_REVERSALS = 3, 3
 """Different values, and changes of direction, that prove noise."""
 FALSE_ALARM = 1e-9
 """Probability that a measuring sensor repeats its value so often, for each change of the value."""
@@ -147,8 +147,8 @@ def _score(block: list[float]) -> int:
     count = len(set(block))
     steps = np.sign(np.diff(block))
     steps = steps[steps != 0]
-    turns = int(np.count_nonzero(steps[1:] != steps[:-1]))
-    return count if count >= FEWEST_VALUES and turns >= FEWEST_TURNS else 1
+    reversals = int(np.count_nonzero(steps[1:] != steps[:-1]))
+    return count if count >= FEWEST_VALUES and reversals >= FEWEST_REVERSALS else 1
 
 
 def largest_repetition(score: float) -> float:

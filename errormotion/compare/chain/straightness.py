@@ -124,14 +124,14 @@ def _unknown(name: str, ds: xr.Dataset, q: xr.DataArray, place: str) -> str:
     E = ds.em.twist().values
     shift = np.abs(np.asarray(q.broadcast_like(ds["EX"]).transpose(*ds["EX"].dims).values, dtype=float))
     axis = direction_of(str(ds.attrs["component"]))
-    turns = np.delete(E[..., 3:], axis, axis=-1)
-    effect = np.abs(shift[..., None] * (turns - _reference(turns)))
+    rotations = np.delete(E[..., 3:], axis, axis=-1)
+    effect = np.abs(shift[..., None] * (rotations - _reference(rotations)))
     if not np.isfinite(effect).any():
         return text + "; how much the other point would change it is unknown without rotations."
     return text + f"; at the other point it differs by up to {1e6 * np.nanmax(effect):.2g} um."
 
 
-def _reference(turns: Array) -> Array:
+def _reference(rotations: Array) -> Array:
     """Return the rotation at the first place; a constant rotation adds a line, which is no straightness."""
-    first: Array = turns.reshape(-1, turns.shape[-1])[:1]
+    first: Array = rotations.reshape(-1, rotations.shape[-1])[:1]
     return np.nan_to_num(first)

@@ -94,8 +94,8 @@ class Field:
 
     def needed(self) -> list[str]:
         """Return the freedoms that act on the displacement of this tool, known or not."""
-        turns = [k for k in range(3) if any((self.lever[j] != 0 or self.travel[j]) for j in range(3) if j != k)]
-        return [*DOF[:3], *(DOF[3 + k] for k in turns)]
+        rotations = [k for k in range(3) if any((self.lever[j] != 0 or self.travel[j]) for j in range(3) if j != k)]
+        return [*DOF[:3], *(DOF[3 + k] for k in rotations)]
 
     def spread(self, positions: Array, weights: Weights, time: Array | None) -> tuple[Array, Array]:
         """Return the covariance of the displacement, (n, 3, 3), and the effects of the sources, (source, n, 3).

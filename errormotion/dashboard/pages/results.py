@@ -80,7 +80,7 @@ class Figure(Guarded):
 
     async def get(self) -> None:
         """Send the figure of the errors at the functional point of the query."""
-        found = await self.in_thread(_course, self.context.lab, self.value("run", 600), *self.point_and_indices())
+        found = await self.in_thread(_curves, self.context.lab, self.value("run", 600), *self.point_and_indices())
         freedoms = [text for text in self.get_query_arguments("freedom") if len(text) < 20]
         item = await self.in_thread(errors_item, found, freedoms)
         point = [1e3 * float(each) if math.isfinite(each) else None for each in found.point]
@@ -116,7 +116,7 @@ class Values(Figure):
     async def get(self) -> None:
         """Send the table."""
         key = self.value("run", 600)
-        found = await self.in_thread(_course, self.context.lab, key, *self.point_and_indices())
+        found = await self.in_thread(_curves, self.context.lab, key, *self.point_and_indices())
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{_safe(key)}.csv"')
         self.finish(await self.in_thread(as_csv, found))
@@ -164,7 +164,7 @@ def loaded(path: Path) -> xr.Dataset:
     return LOADED.get(stamp(path), load)
 
 
-def _course(lab: Lab, key: str, point: tuple[float, ...] | None, select: dict[str, int]) -> CurveSet:
+def _curves(lab: Lab, key: str, point: tuple[float, ...] | None, select: dict[str, int]) -> CurveSet:
     return curves_of(loaded(lab.file(key, "errors")), point, select)
 
 

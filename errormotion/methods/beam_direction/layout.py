@@ -117,8 +117,8 @@ class Layout(PluginSettings):
         for name in ("nominal_direction", "triangulation_normal"):
             vector = getattr(self, name)
             if vector is not None and not MIN_COMPONENT <= max(map(abs, vector)) <= 1 / MIN_COMPONENT:
-                found = ", ".join(f"{component:g}" for component in vector)
-                raise ValueError(f"{name}: expected a direction; found ({found})")
+                components = ", ".join(f"{component:g}" for component in vector)
+                raise ValueError(f"{name}: expected a direction; found ({components})")
         if self.path and len(self.path) < 9:
             raise ValueError(f"path: expected 9 positions or more; found {len(self.path)}")
         return self

@@ -64,16 +64,16 @@ class BeamDirection(ModelMethod):
         from errormotion.datasets.calibrations.inclination import InclinationCalibration
         from errormotion.methods.beam_direction.identification.reading import NORMAL_NEEDED, RECEIVER_NEEDED
 
-        found = {}
+        mistakes = {}
         try:
             InclinationCalibration.find(settings.compensation)
         except DatasetError as error:
-            found["compensation"] = str(error)
+            mistakes["compensation"] = str(error)
         if settings.layout.triangulation_normal is None:
-            found["layout.triangulation_normal"] = NORMAL_NEEDED
+            mistakes["layout.triangulation_normal"] = NORMAL_NEEDED
         if settings.receiver is None:
-            found["receiver"] = RECEIVER_NEEDED
-        return found
+            mistakes["receiver"] = RECEIVER_NEEDED
+        return mistakes
 
     def check_bench(
         self,

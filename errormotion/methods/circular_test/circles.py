@@ -86,12 +86,12 @@ class Circles:
     def deviation(self) -> Array:
         """Length minus radius, without the second order of the set-up offset, (2, run, sample), m."""
         first = self.length + self.radius * self.expansion * self.excess[:, :, None] - self.radius
-        found, x, y = first, np.cos(self.angle), np.sin(self.angle)
+        deviation, x, y = first, np.cos(self.angle), np.sin(self.angle)
         for _ in range(2):  # each pass reduces the error by the offset over the radius
-            offset = self._fitted(found, self.decay)[1][1:3]
+            offset = self._fitted(deviation, self.decay)[1][1:3]
             along, across = offset[0] * x + offset[1] * y, offset[1] * x - offset[0] * y
-            found = first - (np.hypot(self.radius + along, across) - self.radius - along)
-        return np.asarray(found)
+            deviation = first - (np.hypot(self.radius + along, across) - self.radius - along)
+        return np.asarray(deviation)
 
     def model(self, decay: float) -> tuple[Array, Array]:
         """Return the model of the path by a fit to readings: its values there, and circle and parameters, (12,)."""
@@ -107,10 +107,12 @@ class Circles:
         design = np.hstack([circle(angle), basis(angle, sense, self.radius, self.feed, decay)])
         normal = design.T @ design
         scale = np.sqrt(np.diagonal(normal))
-        found = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12) @ (design.T @ deviation[known] / scale)
+        coefficients = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12) @ (
+            design.T @ deviation[known] / scale
+        )
         at_readings = np.full(deviation.shape, np.nan)
-        at_readings[known] = design @ (found / scale)
-        return at_readings, found / scale
+        at_readings[known] = design @ (coefficients / scale)
+        return at_readings, coefficients / scale
 
 
 def read(raw: xr.Dataset, settings: CircularTestSettings, notes: list[str]) -> Circles:
@@ -249,9 +251,9 @@ def problem_of(
     MethodError
         A gap is wider than the settings allow, or the noise is neither stated nor found.
     """
-    at_readings, found = circles.model(decay)
+    at_readings, at_sectors = circles.model(decay)
     sector = np.floor(circles.angle / TAU * places).astype(int) % places + places * np.arange(2)[:, None, None]
-    within = at_readings.ravel() - (circles.over_sectors(places, decay) @ found).ravel()[sector.ravel()]
+    within = at_readings.ravel() - (circles.over_sectors(places, decay) @ at_sectors).ravel()[sector.ravel()]
     known = np.isfinite(circles.length).ravel()
     index, r = sector.ravel()[known], (circles.deviation.ravel() - within)[known]
     count = np.bincount(index, minlength=2 * places)

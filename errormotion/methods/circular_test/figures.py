@@ -104,10 +104,10 @@ def _of_sectors(
         problem = autoregressive(problem, sectors.order, phi, sectors.series)
     errors = errors_of(fit(problem), places_of(sectors), shared=DRIFT)
     sources = sorted(errors.sources, key=lambda source: source.group == DRIFT)
-    found = circles.model(decay)[1]
+    at_sectors = circles.model(decay)[1]
     parts = 2 * int(np.clip(np.ceil(OF_DECAY / 2 * TAU / places / decay), *PARTS))
-    within = circles.over_sectors(places * parts, decay) @ found
-    modelled = circles.over_sectors(places, decay) @ found
+    within = circles.over_sectors(places * parts, decay) @ at_sectors
+    modelled = circles.over_sectors(places, decay) @ at_sectors
     shape = within - np.repeat(modelled, parts, axis=1)
     value, u = errors.value.reshape(2, -1), np.sqrt(errors.own).reshape(2, -1)
     step = np.diff(value - modelled, axis=1) / np.hypot(u[:, 1:], u[:, :-1])
@@ -144,7 +144,7 @@ def of_path(
     def figures(values: Array) -> Array:
         return evaluate(np.repeat(values, parts, axis=-1) + shape)
 
-    found = of_noisy_values(
+    extremes = of_noisy_values(
         figures,
         deviation,
         independent,
@@ -154,10 +154,10 @@ def of_path(
         bias_uncertainty=(FLAT - POINTED) / FLAT,
         skewed=True,
     )
-    value = found.value - found.bias
+    value = extremes.value - extremes.bias
     value = np.where(np.isin(NAMES, POSITIVE), np.maximum(value, 0.0), value)
-    effect = [figures(deviation + each) - found.value for each in shared]
-    return Figures(value, np.asarray(found.covariance), dict(zip(names or [], effect, strict=False)))
+    effect = [figures(deviation + each) - extremes.value for each in shared]
+    return Figures(value, np.asarray(extremes.covariance), dict(zip(names or [], effect, strict=False)))
 
 
 def evaluate(deviation: Array) -> Array:

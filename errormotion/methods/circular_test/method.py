@@ -141,7 +141,7 @@ class CircularTest(ModelMethod):
         """Return the figures of ISO 230-4, with their limits."""
         limits = {name: float(errors.attrs[name]) for name in LIMITS if name in errors.attrs}
         effects = errors["figure_influence"].values if "figure_influence" in errors else None
-        sources, found = errors["source"].values.tolist(), []
+        sources, merits = errors["source"].values.tolist(), []
         for k, name in enumerate(errors["figure"].values.tolist()):
             U = 2 * float(np.sqrt(errors["figure_covariance"].values[k, k]))
             limit = limits.get(LIMITS[1] if name == "H" else LIMITS[0] if name[0] == "G" else "")
@@ -149,8 +149,8 @@ class CircularTest(ModelMethod):
             value = float(errors["figures"][k])
             if name == "D":  # follows from the errors alone
                 value, U, effect = *_mean(errors), None
-            found.append(FigureOfMerit(f"{name} {errors.attrs['plane']}", value, U, "m", limit, effect))
-        return found
+            merits.append(FigureOfMerit(f"{name} {errors.attrs['plane']}", value, U, "m", limit, effect))
+        return merits
 
 
 def _finished(solved: Solved, *, circles: Circles, sectors: Sectors, settings: Any) -> Solved:

@@ -103,9 +103,9 @@ def over_sectors(places: int, radius: float, feed: float, decay: float) -> Array
     offsets = (np.arange(_SUBDIVISION) + 0.5) / _SUBDIVISION - 0.5
     angle = np.array([middles(places)[:, None] + offsets * TAU / places] * 2)
     path = basis(angle, np.broadcast_to(SENSE[:, None, None], angle.shape), radius, feed, decay)
-    found: Array = np.concatenate([circle(angle), path], axis=-1).mean(axis=2)
-    found.flags.writeable = False
-    return found
+    means: Array = np.concatenate([circle(angle), path], axis=-1).mean(axis=2)
+    means.flags.writeable = False
+    return means
 
 
 def position(errors: Mapping[str, float], angle: Array, sense: Array, settings: CircularTestSettings) -> Array:

@@ -92,20 +92,20 @@ class CrossbeamScan(ModelMethod):
         """Return what contradicts the machine: Y does not carry the tool, or passes outside of its travel."""
         if "Y" not in machine.tool_axes:
             return {"": f"expected a machine whose axis Y carries the tool; found the chain '{machine.chain}'"}
-        found = {}
+        mistakes = {}
         low, high = machine.travel["Y"]
         if settings.travel and (settings.travel[0] < low - 1e-9 or settings.travel[1] > high + 1e-9):
-            found["travel"] = (
+            mistakes["travel"] = (
                 f"expected ends within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
                 f"found {settings.travel[0] * 1e3:g} mm to {settings.travel[1] * 1e3:g} mm"
             )
         positions = settings.positions if settings.procedure == "scan" else (settings.pocket_position,)
         if outside := [y for y in positions if not low <= y <= high]:
-            found["positions"] = (
+            mistakes["positions"] = (
                 f"expected positions within the travel of Y, {low * 1e3:g} mm to {high * 1e3:g} mm; "
                 f"found {outside[0] * 1e3:g} mm"
             )
-        return found
+        return mistakes
 
     def check_bench(
         self,

@@ -86,9 +86,9 @@ def strained(raw: xr.Dataset, settings: CrossbeamScanSettings, generator: np.ran
 
 def truth_of(machine: VirtualMachine, errors: xr.Dataset, clock: float) -> xr.Dataset:  # noqa: ARG001 - the interface
     """Return the true errors at the times of the scans of an error dataset; the warm-up starts at its time 0."""
-    found = truth_axis(machine, errors["time"].values, errors["y"].values)
+    true = truth_axis(machine, errors["time"].values, errors["y"].values)
     twist = machine.crossbeam.twist(errors["scan_time"].values, errors["y"].values)  # at the time of each scan
-    return found.assign({name: (("time", "position"), twist[..., k], found[name].attrs) for k, name in enumerate(DOF)})
+    return true.assign({name: (("time", "position"), twist[..., k], true[name].attrs) for k, name in enumerate(DOF)})
 
 
 def truth_axis(machine: VirtualMachine, times: ArrayLike, positions: ArrayLike) -> xr.Dataset:

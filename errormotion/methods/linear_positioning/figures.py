@@ -90,9 +90,9 @@ def _largest_of(errors: xr.Dataset, diagonals: Sequence[str]) -> FigureOfMerit:
     """
     of = errors.sel(diagonal=list(diagonals), figure="E")
     value, bias, u = (of[f"figure_{part}"].values for part in ("value", "bias", "u"))
-    found = largest(value[:, None], (u**2)[:, None, None], np.zeros((0, value.size, 1)))
-    U = float(expanded(bias[found.place] + found.bias, found.u))
-    return FigureOfMerit("largest E of the body diagonals (ISO 230-6)", found.value, U, "m")
+    distribution = largest(value[:, None], (u**2)[:, None, None], np.zeros((0, value.size, 1)))
+    U = float(expanded(bias[distribution.place] + distribution.bias, distribution.u))
+    return FigureOfMerit("largest E of the body diagonals (ISO 230-6)", distribution.value, U, "m")
 
 
 def _distortion(errors: xr.Dataset) -> list[FigureOfMerit]:

@@ -228,13 +228,13 @@ class LinearPositioning(ModelMethod):
         solved = replace(solved, observed=replace(solved.observed, extras=more))
         origin = provenance.make(settings, checked, None, steps=evaluated.steps)
         limits = {name: limit for name in LIMITS.values() if (limit := getattr(settings, name)) is not None}
-        found = dataset(self, solved, checked, self.info, origin)
+        errors = dataset(self, solved, checked, self.info, origin)
         if "cycle" not in checked.dims:
-            found = found.assign_attrs(limits)
+            errors = errors.assign_attrs(limits)
         place = settings.straightness_reference
         if not place or "diagonal" in checked.dims:
-            return found
-        return found.assign_attrs({"straightness_reference": place} | found.attrs)
+            return errors
+        return errors.assign_attrs({"straightness_reference": place} | errors.attrs)
 
     def simulate(self, settings: LinearPositioningSettings, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
         """Return raw data with every source of the model drawn once, and the true errors.

@@ -189,26 +189,26 @@ def _words_after(lines: Lines, key: str) -> Iterator[tuple[int, list[str]]]:
 
 def _targets(lines: Lines, mistakes: Mistakes) -> list[float]:
     """Return the positions of the targets, m."""
-    found: list[float] = []
+    positions: list[float] = []
     for number, words in _words_after(lines, "targets"):
         for word in words:
             value = float(word) if _NUMBER.fullmatch(word) else math.nan
             if not math.isfinite(value):
                 mistakes.add(number, f"targets: expected positions in mm; found '{word[:40]}'", "targets")
-            found.append(value * 1e-3)
+            positions.append(value * 1e-3)
     stated = _stated(lines, "target-count")
-    if not found or len(found) > MAX_COUNT:
-        mistakes.add(0, f"TARGET DATA:: expected 1 to {MAX_COUNT} positions after 'Targets :'; found {len(found)}")
-    elif stated != str(len(found)):
-        mistakes.add(0, f"Target-count: expected the number of targets, {len(found)}; found '{stated[:40]}'")
-    elif len(set(found)) < len(found):
+    if not positions or len(positions) > MAX_COUNT:
+        mistakes.add(0, f"TARGET DATA:: expected 1 to {MAX_COUNT} positions after 'Targets :'; found {len(positions)}")
+    elif stated != str(len(positions)):
+        mistakes.add(0, f"Target-count: expected the number of targets, {len(positions)}; found '{stated[:40]}'")
+    elif len(set(positions)) < len(positions):
         mistakes.add(0, "Targets: expected different positions; found one of them twice")
-    return found[:MAX_COUNT]
+    return positions[:MAX_COUNT]
 
 
 def _runs(lines: Lines, count: int, mistakes: Mistakes) -> dict[int, dict[int, float]]:
     """Return the deviations by run and target (from 0), both in the order of the file."""
-    found: dict[int, dict[int, float]] = {}
+    deviations: dict[int, dict[int, float]] = {}
     for number, words in _words_after(lines, "run target data"):
         if len(words) != 3 or not (_WHOLE.fullmatch(words[0]) and _WHOLE.fullmatch(words[1])):
             shown = " ".join(words)[:40]
@@ -220,13 +220,13 @@ def _runs(lines: Lines, count: int, mistakes: Mistakes) -> dict[int, dict[int, f
             mistakes.add(number, f"expected a run from 1 and a target from 1 to {count}; found {run} and {target + 1}")
         elif not math.isfinite(value):
             mistakes.add(number, f"expected a deviation; found '{words[2][:40]}'", "deviation")
-        elif target in found.setdefault(run, {}):
+        elif target in deviations.setdefault(run, {}):
             mistakes.add(number, f"run {run}: expected each target once; found target {target + 1} twice")
         else:
-            found[run][target] = value
-    if not found:
+            deviations[run][target] = value
+    if not deviations:
         mistakes.add(0, "DEVIATIONS:: expected lines of run, target and deviation after 'Run Target Data:'; found none")
-    return found
+    return deviations
 
 
 def _passes(
@@ -243,7 +243,7 @@ def _passes(
     return passes
 
 
-def _check_count(lines: Lines, found: int, mistakes: Mistakes) -> None:
+def _check_count(lines: Lines, runs: int, mistakes: Mistakes) -> None:
     stated = _stated(lines, "run-count")
-    if stated and stated != str(found):
-        mistakes.add(0, f"Run-count: expected the number of runs with deviations, {found}; found '{stated[:40]}'")
+    if stated and stated != str(runs):
+        mistakes.add(0, f"Run-count: expected the number of runs with deviations, {runs}; found '{stated[:40]}'")

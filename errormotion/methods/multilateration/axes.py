@@ -321,12 +321,12 @@ def _field(axes: AxisErrors, q: Array, tool: Array) -> Array:
 def _rest(axes: AxisErrors, q: Array, tool: Array) -> Array:
     """Return the covariance (k, 6, 6) of the twists by the orders of the error motions that were not fitted."""
     J = axes.volume.machine.jacobian(q, tool)
-    found = np.zeros((len(q), _DOFS, _DOFS))
+    covariance = np.zeros((len(q), _DOFS, _DOFS))
     for k, motion in enumerate(axes.volume.motions):
         if motion not in axes.undetermined and len(axes.rest[motion]):
             variance = axes.rest_at(motion, q[:, axes.volume.axis(motion)])
-            found += variance[:, None, None] * J[:, :, k, None] * J[:, None, :, k]
-    return found
+            covariance += variance[:, None, None] * J[:, :, k, None] * J[:, None, :, k]
+    return covariance
 
 
 def _known_dofs(axes: AxisErrors, q: Array, tool: Array) -> NDArray[np.bool_]:

@@ -134,10 +134,10 @@ def condition(fit: Fit, approximate: Array) -> float:
     """
     x, free = fit.unknowns, fit.problem.unknowns.target.freed[:, 0]
     stations = Stations(x.station[:, :3], x.station[:, 3])
-    found = _freedoms(fit.normal.S, fit.normal.F, stations, x.target, free)
-    if found[3].any():
-        raise FitError(_described(found, stations, x.target[free], approximate), code="network.undetermined")
-    return float(found[0][-1] / found[0][0])
+    decomposed = _freedoms(fit.normal.S, fit.normal.F, stations, x.target, free)
+    if decomposed[3].any():
+        raise FitError(_described(decomposed, stations, x.target[free], approximate), code="network.undetermined")
+    return float(decomposed[0][-1] / decomposed[0][0])
 
 
 def undetermined(problem: Problem, approximate: Array) -> str:
@@ -149,10 +149,10 @@ def undetermined(problem: Problem, approximate: Array) -> str:
     S = D + np.diag(linear.border_prior()[0]) - np.tensordot(G, F, axes=((0, 1), (0, 1)))
     target, station = linear.at.tables[:2]
     stations = Stations(station[:, :3], station[:, 3])
-    found = _freedoms(S, F, stations, target, free)
-    if not found[3].any():
+    decomposed = _freedoms(S, F, stations, target, free)
+    if not decomposed[3].any():
         return "The distances do not determine stations and targets. Distribute them more widely."
-    return _described(found, stations, target[free], approximate)
+    return _described(decomposed, stations, target[free], approximate)
 
 
 def _freedoms(
@@ -171,10 +171,10 @@ def _freedoms(
 
 
 def _described(
-    found: tuple[Array, Array, Array, NDArray[np.bool_]], stations: Stations, target: Array, approximate: Array
+    decomposed: tuple[Array, Array, Array, NDArray[np.bool_]], stations: Stations, target: Array, approximate: Array
 ) -> str:
     """Return the undetermined freedoms as text, with the cause."""
-    values, motions, sigma, lost = found
+    values, motions, sigma, lost = decomposed
     k, centre = int(np.count_nonzero(lost)), target.mean(axis=0)
     named = "; ".join(describe(motions[:, i], stations, centre) for i in np.flatnonzero(lost)[:_DESCRIBED])
     worst = sigma[0] if values[0] > ROUNDING * values[-1] else np.inf
@@ -253,20 +253,20 @@ def _length(sigma: float) -> str:
 
 def _reason(position: Array, target: Array) -> str:
     """Return the deficiencies of the positions, each with its remedy."""
-    n, found = len(position), []
+    n, reasons = len(position), []
     thin = np.linalg.svd(position - position.mean(axis=0), compute_uv=False)
     if thin[1] < FLAT * thin[0]:
-        found.append("the stations are on one line: move two of them off it, to different sides")
+        reasons.append("the stations are on one line: move two of them off it, to different sides")
     elif thin[2] < FLAT * thin[0]:
-        found.append(
+        reasons.append(
             f"the stations are in one plane (within {thin[2] / thin[0]:.1%} of their extent): move one of them off it, "
             "by about their distance"
         )
     flat = np.linalg.svd(target - target.mean(axis=0), full_matrices=False, compute_uv=False)
     if flat[1] < FLAT * flat[0]:
-        found.append("the targets are on one line: add targets off it")
+        reasons.append("the targets are on one line: add targets off it")
     elif flat[2] < FLAT * flat[0]:
-        found.append("the targets are in one plane: add targets off it")
+        reasons.append("the targets are in one plane: add targets off it")
     sight = target.mean(axis=0) - position
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     for j in range(n):
@@ -274,12 +274,12 @@ def _reason(position: Array, target: Array) -> str:
             if np.linalg.norm(position[j] - position[k]) < SAME_DIRECTION * np.linalg.norm(
                 target.mean(axis=0) - position[j]
             ):
-                found.append(f"stations {j + 1} and {k + 1} are nearly at the same position: move one of them")
+                reasons.append(f"stations {j + 1} and {k + 1} are nearly at the same position: move one of them")
             elif np.linalg.norm(np.cross(sight[j], sight[k])) < SAME_DIRECTION:
-                found.append(f"stations {j + 1} and {k + 1} are in one line with the targets: move one of them aside")
-    if not found:
-        found.append("distribute stations and targets more widely in all three directions, or measure more targets")
-    return "; ".join(found)
+                reasons.append(f"stations {j + 1} and {k + 1} are in one line with the targets: move one of them aside")
+    if not reasons:
+        reasons.append("distribute stations and targets more widely in all three directions, or measure more targets")
+    return "; ".join(reasons)
 
 
 def weak_layout(own: Array, shared: Sequence[Array], noise: float, approximate: Array, target: Array) -> list[str]:
@@ -305,14 +305,14 @@ def weak_layout(own: Array, shared: Sequence[Array], noise: float, approximate: 
     ]
 
 
-def swapped_stations(found: Array, approximate: Array | None) -> list[tuple[int, int]]:
+def swapped_stations(position: Array, approximate: Array | None) -> list[tuple[int, int]]:
     """Return pairs of stations (j, k), from 0, if another order fits much better: j is at the stated position of k.
 
     Positions are (n, 3), m: estimated, and stated.
     """
     if approximate is None or not np.isfinite(approximate).all():
         return []
-    off = np.linalg.norm(found[:, None] - approximate[None], axis=-1)
+    off = np.linalg.norm(position[:, None] - approximate[None], axis=-1)
     if (off.argmin(axis=1) == np.arange(len(off))).all():
         return []  # each is closest to its own: no other order has a smaller sum
     from scipy.optimize import linear_sum_assignment
@@ -323,15 +323,15 @@ def swapped_stations(found: Array, approximate: Array | None) -> list[tuple[int,
     return [(int(j), int(k)) for j, k in zip(rows, columns, strict=True) if j != k]
 
 
-def swap_note(found: Array, approximate: Array | None) -> list[str]:
+def swap_note(position: Array, approximate: Array | None) -> list[str]:
     """Return a note on swapped stations."""
-    pairs = swapped_stations(found, approximate)
+    pairs = swapped_stations(position, approximate)
     if not pairs or approximate is None:
         return []
-    order = np.arange(len(found))
+    order = np.arange(len(position))
     for j, k in pairs:
         order[j] = k
-    own, other = (np.linalg.norm(found - each, axis=1).max() * 1e3 for each in (approximate, approximate[order]))
+    own, other = (np.linalg.norm(position - each, axis=1).max() * 1e3 for each in (approximate, approximate[order]))
     changed = ", ".join(f"the readings of station {j + 1} are those of station {k + 1}" for j, k in pairs)
     return [
         f"Stations are probably swapped: {changed}. As stated, they are up to {own:.4g} mm from their approximate "

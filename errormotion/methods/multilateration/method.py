@@ -138,8 +138,8 @@ class Multilateration(ModelMethod):
         from errormotion.methods.multilateration.readings import latest
         from errormotion.methods.multilateration.repeatability import displaced
 
-        found = super().trial_model(latest(raw), settings, errors)
-        return displaced(found, errors) if settings.together and "repeatability" in errors else found
+        model = super().trial_model(latest(raw), settings, errors)
+        return displaced(model, errors) if settings.together and "repeatability" in errors else model
 
     def plan(self, settings: MultilaterationSettings | None = None) -> xr.Dataset:
         """Return an error dataset of zeros with the expected covariance of the layout, and the best layout."""

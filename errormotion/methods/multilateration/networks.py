@@ -76,8 +76,8 @@ class Network:
     def residual(self) -> Array:
         """Reading minus model, (n, m), m, also of wrong readings; NaN without a position of the target."""
         every = replace(self.solved.fit.problem, readings=self.reading.ravel())
-        found = every.residuals(self.solved.fit.linear.at).reshape(self.reading.shape)
-        return np.where(np.isfinite(self.target[:, 0]), found, np.nan)
+        residual = every.residuals(self.solved.fit.linear.at).reshape(self.reading.shape)
+        return np.where(np.isfinite(self.target[:, 0]), residual, np.nan)
 
     @property
     def redundancy(self) -> Array:
@@ -88,17 +88,17 @@ class Network:
     @cached_property
     def left_out(self) -> tuple[tuple[int, int], ...]:
         """Readings (station, target) that are wrong."""
-        found = self.wrong.copy()
+        excluded = self.wrong.copy()
         for each in () if self.solved.cleaned is None else self.solved.cleaned.made:
-            found |= each.readings.reshape(found.shape) & (not each.rivals)
-        return tuple((int(j), int(i)) for j, i in np.argwhere(found))
+            excluded |= each.readings.reshape(excluded.shape) & (not each.rivals)
+        return tuple((int(j), int(i)) for j, i in np.argwhere(excluded))
 
     @cached_property
     def undecided(self) -> tuple[int, ...]:
         """Targets with a wrong reading that is not identified."""
         made = () if self.solved.cleaned is None else self.solved.cleaned.made
-        found = [np.flatnonzero(each.readings.reshape(self.wrong.shape).any(axis=0)) for each in made if each.rivals]
-        return tuple(sorted({int(i) for each in found for i in each}))
+        stations = [np.flatnonzero(each.readings.reshape(self.wrong.shape).any(axis=0)) for each in made if each.rivals]
+        return tuple(sorted({int(i) for each in stations for i in each}))
 
 
 def solve(

@@ -233,10 +233,10 @@ class _Finish:
 
     def labels(self) -> dict[str, list[str]]:
         """Return the labels of the dims of further variables."""
-        found = {"station": self.data.stations, "direction": list("xyz"), "direction_": list("xyz")}
+        labels = {"station": self.data.stations, "direction": list("xyz"), "direction_": list("xyz")}
         if self.drift is not None and self.drift.pairs:
-            found["drift_term"] = ["dead path", "x", "y", "z"]
-        return found
+            labels["drift_term"] = ["dead path", "x", "y", "z"]
+        return labels
 
     def of_gross(self) -> list[str]:
         """Return a note on readings that contradict the commanded positions."""
@@ -315,10 +315,10 @@ class _Finish:
 
     def _left_out(self, solved: Solved) -> NDArray[np.int8]:
         """Return for each reading (n, m): 0 = used, 1 = wrong, 2 = one of several of which one is wrong."""
-        found = self.wrong.astype(np.int8)
+        excluded = self.wrong.astype(np.int8)
         for each in () if solved.cleaned is None else solved.cleaned.made:
-            found[each.readings.reshape(found.shape)] = 2 if each.rivals else 1
-        return found
+            excluded[each.readings.reshape(excluded.shape)] = 2 if each.rivals else 1
+        return excluded
 
     def _extras(
         self,

@@ -108,12 +108,12 @@ def initial_stations(reading: Array, weight: Array, target: Array, station: Arra
                 )
             positions[j], dead_paths[j] = approximate + centre, np.median(np.linalg.norm(u - approximate, axis=1) - d)
             continue
-        found, scale = _best(_start_values(d, u, approximate, normal), d, u)
+        start, scale = _best(_start_values(d, u, approximate, normal), d, u)
         if scale > MAX_MISFIT * extent and normal is None:
-            found, scale = min((found, scale), _best(_from_subsets(d, u), d, u), key=lambda each: each[1])
-        if scale > MAX_MISFIT * extent or _reversed(d, u, found, normal, scale):
+            start, scale = min((start, scale), _best(_from_subsets(d, u), d, u), key=lambda each: each[1])
+        if scale > MAX_MISFIT * extent or _reversed(d, u, start, normal, scale):
             raise MethodError(_misfit_message(j, d, u, extent, scale), code="network.station.misfit")
-        positions[j], dead_paths[j] = found[:3] + centre, found[3]
+        positions[j], dead_paths[j] = start[:3] + centre, start[3]
     return Stations(positions, dead_paths)
 
 
@@ -169,9 +169,9 @@ def _linear(d: Array, u: Array) -> Array:
     """Return (U, L) of a station from the equations that are linear in U, L and K."""
     middle = np.median(d)
     d = d - middle
-    found = _reweighted(np.column_stack([2 * u, 2 * d, np.ones(len(d))]), np.sum(u**2, axis=1) - d**2)[:4]
-    found[3] -= middle
-    return found
+    solution = _reweighted(np.column_stack([2 * u, 2 * d, np.ones(len(d))]), np.sum(u**2, axis=1) - d**2)[:4]
+    solution[3] -= middle
+    return solution
 
 
 def _start_values(d: Array, u: Array, approximate: Array | None, normal: Array | None) -> Iterator[Array]:
@@ -212,20 +212,20 @@ def _from_subsets(d: Array, u: Array) -> list[Array]:
     return [x for _, x in sorted(tried, key=lambda each: each[0])[:3]]
 
 
-def _reversed(d: Array, u: Array, found: Array, normal: Array | None, scale: float) -> bool:
+def _reversed(d: Array, u: Array, position: Array, normal: Array | None, scale: float) -> bool:
     """Return whether readings fit much better with the opposite sign; with far stations both fit nearly as well."""
-    x = _linear(d, u) if normal is None else found
+    x = _linear(d, u) if normal is None else position
     return bool(x[3] + np.median(d) < 0 and _refined(np.append(x[:3], -x[3]), -d, u)[1] < 0.3 * scale)
 
 
 def _best(start_values: Iterable[Array], d: Array, u: Array) -> tuple[Array, float]:
     """Return the best (U, L) from some start values, and the robust scale of its residuals, m."""
-    good, found = _GOOD_FIT * _shape(u, 1)[1], []
+    good, solutions = _GOOD_FIT * _shape(u, 1)[1], []
     for x in start_values:
-        found.append(_refined(x, d, u))
-        if found[-1][1] < good:
+        solutions.append(_refined(x, d, u))
+        if solutions[-1][1] < good:
             break
-    return min(found, key=lambda each: each[1])
+    return min(solutions, key=lambda each: each[1])
 
 
 def _residuals(x: Array, d: Array, u: Array) -> tuple[Array, Array, float]:

@@ -38,10 +38,10 @@ def contradiction(solved: Solved, probing: Probing, smallest_move: float) -> str
     MethodError
         They contradict these axes, and all of them agree with others.
     """
-    found = agreeing_axes(solved, probing, smallest_move)
-    if not found or solved.cleaned is None:
+    agreeing = agreeing_axes(solved, probing, smallest_move)
+    if not agreeing or solved.cleaned is None:
         return ""
-    stated, other = probing.motion.tool_axes or "none", " or ".join(axes or "none" for axes in found)
+    stated, other = probing.motion.tool_axes or "none", " or ".join(axes or "none" for axes in agreeing)
     if len(solved.cleaned.made) == 1 and probing.usable(solved.fit.problem).all():
         return (
             f"All touches would agree without any exclusion if other axes carried the tool: {other} instead of "
@@ -75,7 +75,7 @@ def agreeing_axes(solved: Solved, probing: Probing, smallest_move: float) -> lis
     except FitError:
         return []
     anchor = solved.fit.constants.centre if probing.data.seen.touched else solved.fit.unknowns.reach
-    found: list[tuple[float, str]] = []
+    agreeing: list[tuple[float, str]] = []
     for axes in AXES:
         other = replace(probing, motion=Motion(axes, probing.motion.point))
         if axes == probing.motion.tool_axes or undetermined(anchor, other.motion):
@@ -85,10 +85,10 @@ def agreeing_axes(solved: Solved, probing: Probing, smallest_move: float) -> lis
             if gain <= ODDS + (special.chdtri(further, FALSE_ALARM) if further else 0.0):
                 continue
             if agrees(other.cleaned(smallest_move), other):
-                found.append((-gain, axes))
+                agreeing.append((-gain, axes))
         except FitError:
             continue
-    return [axes for _, axes in sorted(found)]
+    return [axes for _, axes in sorted(agreeing)]
 
 
 def agrees(cleaned: Cleaned, probing: Probing) -> bool:
@@ -126,6 +126,6 @@ def _gain(own: _Whole, other: _Whole) -> tuple[float, int]:
     return (own.chi2(both) - other.chi2(both)) / variance, further
 
 
-def _scatter_as_stated(found: Fit) -> bool:
-    stated = found.problem.noise.stated
-    return not (stated and found.freedom > 0 and found.chi2 > special.chdtri(found.freedom, FALSE_ALARM))
+def _scatter_as_stated(solution: Fit) -> bool:
+    stated = solution.problem.noise.stated
+    return not (stated and solution.freedom > 0 and solution.chi2 > special.chdtri(solution.freedom, FALSE_ALARM))

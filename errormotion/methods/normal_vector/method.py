@@ -97,15 +97,15 @@ class NormalVector(ModelMethod):
 
     def check(self, settings: NormalVectorSettings) -> dict[str, str]:
         """Return the settings with which no campaign is possible: too few balls, or no cycle after the cold one."""
-        found = {}
+        mistakes = {}
         if len(settings.balls) < 3:
-            found["balls"] = f"expected the approximate centres of three or more balls; found {len(settings.balls)}"
+            mistakes["balls"] = f"expected the approximate centres of three or more balls; found {len(settings.balls)}"
         if settings.interval > settings.duration:
-            found["interval"] = (
+            mistakes["interval"] = (
                 f"expected at most the duration, {settings.duration:g} s, so that a cycle follows the cold one; "
                 f"found {settings.interval:g} s"
             )
-        return found
+        return mistakes
 
     def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
         """Return the axes that carry the tool."""

@@ -84,14 +84,14 @@ def plan(method: ModelMethod, settings: NormalVectorSettings) -> xr.Dataset:
     MethodError
         See `expected`.
     """
-    found = planned(method, settings, method.info)
-    loss = found["normals_loss"].values[-1]
+    errors = planned(method, settings, method.info)
+    loss = errors["normals_loss"].values[-1]
     if settings.tool_axes == "XYZ" and len(settings.balls) >= 4:
         four = normals.chosen(touching.names(settings), settings.normals_balls)
         if not normals.planes_apart(np.array([settings.balls[i].centre for i in four])):
             loss = np.full(6, np.inf)
-    ds = found.drop_vars(MEASURED).assign(normals_loss=("dof", loss, {"units": "1"}))
-    return ds.assign_attrs(notes=_notes(settings, found["covariance"].values[-1], loss), tool_axes=settings.tool_axes)
+    ds = errors.drop_vars(MEASURED).assign(normals_loss=("dof", loss, {"units": "1"}))
+    return ds.assign_attrs(notes=_notes(settings, errors["covariance"].values[-1], loss), tool_axes=settings.tool_axes)
 
 
 def _notes(settings: NormalVectorSettings, covariance: Array, loss: Array) -> list[str]:

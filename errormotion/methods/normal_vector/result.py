@@ -89,10 +89,10 @@ def identified(method: ModelMethod, raw: xr.Dataset, settings: NormalVectorSetti
         steps = ["normals of two planes through four balls, Cayley"]
     if solved.cleaned is not None:
         steps += [f"excluded: {each.words}" for each in solved.cleaned.made]
-    found = dataset(method, solved, raw, method.info, provenance.make(settings, raw, None, steps=steps))
-    for note in found.em.notes:
+    errors = dataset(method, solved, raw, method.info, provenance.make(settings, raw, None, steps=steps))
+    for note in errors.em.notes:
         log.warning(note)
-    return found.assign_attrs(tool_axes=str(raw.attrs.get("tool_axes", settings.tool_axes)))
+    return errors.assign_attrs(tool_axes=str(raw.attrs.get("tool_axes", settings.tool_axes)))
 
 
 def observe(raw: xr.Dataset, settings: NormalVectorSettings) -> Observed:

@@ -145,12 +145,12 @@ class Layout:
         n, count, sensors = self.reading.shape
         design = np.concatenate([np.einsum("kj,aji->aki", self.sensor, self.turn),
                                  np.broadcast_to(self.sensor, (n, sensors, 3))], axis=2)  # fmt: skip
-        found = np.zeros((count, 3))
+        offset = np.zeros((count, 3))
         for sphere in range(count):
             there = np.isfinite(self.reading[:, sphere])
-            found[sphere] = np.linalg.lstsq(design[there], self.reading[:, sphere][there], rcond=None)[0][:3]
-        found[:, self.along] = 0.0
-        return found
+            offset[sphere] = np.linalg.lstsq(design[there], self.reading[:, sphere][there], rcond=None)[0][:3]
+        offset[:, self.along] = 0.0
+        return offset
 
     @cached_property
     def determined(self) -> NDArray[np.bool_]:
@@ -187,8 +187,8 @@ class Layout:
             None is.
         """
         patterns, count = np.unique(self._by_angle, axis=0, return_counts=True)
-        found = patterns[np.argmax(count)]
-        if not found.any():
+        pattern = patterns[np.argmax(count)]
+        if not pattern.any():
             raise MethodError(
                 f"No freedom of axis {self.axis} follows from the readings: one sphere off the axis shows EX, EY and "
                 "EZ mixed with the rotations times its distance, two spheres show no rotation about the line through "
@@ -197,7 +197,7 @@ class Layout:
                 f"{1e3 * ON_AXIS:g} mm of the axis, which shows EX, EY and EZ.",
                 code="rotary.freedoms.none",
             )
-        return np.asarray(found)
+        return np.asarray(pattern)
 
     @cached_property
     def gauge(self) -> tuple[Array, Array]:

@@ -148,14 +148,14 @@ class RTest(ModelMethod):
         """
         from errormotion.datasets.results.merit import is_planned
 
-        found, sources = [], errors["source"].values.tolist()
+        merits, sources = [], errors["source"].values.tolist()
         for k, name in enumerate(errors["location"].values.tolist()):
             value, C = float(errors["location_error"][k]), errors["location_covariance"].values
             if np.isfinite(value):
                 effect = dict(zip(sources, errors["location_influence"].values[:, k].tolist(), strict=True))
                 unit, U = "m" if name[1] in "XYZ" else "rad", 2 * float(np.sqrt(C[k, k]))
-                found.append(FigureOfMerit(name, value, U, unit, influence=effect))
-        return found if is_planned(errors) else found + _ranges(errors)
+                merits.append(FigureOfMerit(name, value, U, unit, influence=effect))
+        return merits if is_planned(errors) else merits + _ranges(errors)
 
 
 def _problem(raw: xr.Dataset, layout: Layout) -> Problem:
@@ -221,8 +221,8 @@ def _check_sense(raw: xr.Dataset, problem: Problem) -> None:
     from errormotion.methods.r_test.layout import Layout
 
     def misfit(one: Problem) -> tuple[float, int]:
-        found = fit(replace(one, constants=Known(*(replace(c, adjust=False) for c in one.constants))))
-        return found.chi2, found.freedom
+        solution = fit(replace(one, constants=Known(*(replace(c, adjust=False) for c in one.constants))))
+        return solution.chi2, solution.freedom
 
     chi2, freedom = misfit(problem)
     if freedom < 1 or (problem.noise.stated and chi2 < WRONG_SENSE * freedom):
@@ -293,7 +293,7 @@ def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
     from errormotion.estimation.extremes import expanded, of_noisy_values
     from errormotion.kinematics.iso import DOF, iso_names
 
-    found = []
+    ranges = []
     names = iso_names(str(errors.attrs["component"]))
     for k, dof in enumerate(DOF):
         value = errors[dof].values
@@ -304,5 +304,5 @@ def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
         own = errors["covariance"].values[known, k, k] - np.square(shared).sum(axis=0)
         of = of_noisy_values(lambda v: np.ptp(v, axis=-1), value[known], np.sqrt(np.maximum(own, 0.0)), shared)
         U = float(expanded(of.bias, of.u))
-        found.append(FigureOfMerit(f"range of {names[dof]}", float(of.value), U, "m" if k < 3 else "rad"))
-    return found
+        ranges.append(FigureOfMerit(f"range of {names[dof]}", float(of.value), U, "m" if k < 3 else "rad"))
+    return ranges

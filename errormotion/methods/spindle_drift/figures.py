@@ -35,7 +35,7 @@ def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
     if "iso_value" not in errors:
         return []
     value, uncertainty = errors["iso_value"], errors["iso_uncertainty"]
-    found = []
+    ranges = []
     for quantity in value["quantity"].values:
         unit = "rad" if quantity in ("A", "B") else "m"
         for measure, interval in _RANGES.items():
@@ -44,14 +44,14 @@ def _ranges(errors: xr.Dataset) -> list[FigureOfMerit]:
                 u = float(uncertainty.sel(quantity=quantity, measure=measure))
                 name = f"d({quantity}) {interval}, range (ISO 230-3)"
                 effects = _effects(errors, quantity, measure)
-                found.append(FigureOfMerit(name, size, 2.0 * u, unit, influence=effects))
+                ranges.append(FigureOfMerit(name, size, 2.0 * u, unit, influence=effects))
                 break
-    return found
+    return ranges
 
 
 def _effects(errors: xr.Dataset, quantity: str, measure: str) -> dict[str, float] | None:
     """Return the effect of each source on an ISO 230-3 value; None for a dataset that does not state it."""
     if "iso_influence" not in errors:
         return None
-    found = errors["iso_influence"].sel(quantity=quantity, measure=measure).values
-    return dict(zip(map(str, errors["source"].values), map(float, found), strict=True))
+    effects = errors["iso_influence"].sel(quantity=quantity, measure=measure).values
+    return dict(zip(map(str, errors["source"].values), map(float, effects), strict=True))

@@ -152,9 +152,9 @@ class SpindleDrift(ModelMethod):
         names = {"bar_radius": "bar_radius", "levels": "levels", "noise": "noise"}
         if "thermometer" in instruments:  # otherwise the expansion is not corrected
             names["frame_expansion"] = "expansion"
-        found = {name: getattr(frame, own, None) for name, own in names.items()}
+        of_frame = {name: getattr(frame, own, None) for name, own in names.items()}
         stated = settings.layout.model_fields_set
-        update = {name: value for name, value in found.items() if value is not None and name not in stated}
+        update = {name: value for name, value in of_frame.items() if value is not None and name not in stated}
         return settings.model_copy(update={"layout": settings.layout.model_copy(update=update)})
 
     def plan(self, settings: SpindleDriftSettings | None = None) -> xr.Dataset:

@@ -107,9 +107,9 @@ class Seen:
     def residual(self, y: Array, x: Unknowns[Array], c: Known[Array]) -> Array:
         """Return the residuals (n, 5), m."""
         _, _, _, t, q = self._geometry(y, x, c)
-        found: Array = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2) - c.radius
-        found[:, 4] = t[:, 4]
-        return found
+        residual: Array = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2) - c.radius
+        residual[:, 4] = t[:, 4]
+        return residual
 
     def derivatives(self, y: Array, x: Unknowns[Array], c: Known[Array]) -> dict[str, Array]:
         """Return the derivatives of the residuals by states and readings."""
@@ -166,9 +166,9 @@ class Seen:
 
     def _warming(self, y: Array, c: Known[Array]) -> Array:
         """Return the temperature of the frame relative to the reference state, (n, 1), K."""
-        found: Array = c.warming + y[:, 5:] if y.shape[1] > 5 else c.warming.copy()
-        found[-1] = 0.0
-        return found
+        warming: Array = c.warming + y[:, 5:] if y.shape[1] > 5 else c.warming.copy()
+        warming[-1] = 0.0
+        return warming
 
     def _geometry(
         self, y: Array, x: Unknowns[Array], c: Known[Array]

@@ -37,8 +37,8 @@ def expected(settings: SpindleDriftSettings) -> xr.Dataset:
 
 def plan_beams(settings: SpindleDriftSettings, method: str, version: str) -> xr.Dataset:
     """Return the identification of the expected beam detection, with values of 0."""
-    found = identify_beams(_expected_beams(settings), settings, method, version)
-    kept = found[[*DOF, "covariance", "beam_index"]].assign({name: 0.0 * found[name] for name in DOF})
+    beams = identify_beams(_expected_beams(settings), settings, method, version)
+    kept = beams[[*DOF, "covariance", "beam_index"]].assign({name: 0.0 * beams[name] for name in DOF})
     return kept.assign_attrs(reference=_PLANNED)
 
 

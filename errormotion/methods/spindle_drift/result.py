@@ -106,9 +106,9 @@ class Result:
         observed = solved.observed
         observed = replace(observed, attributes={**observed.attributes, "reference_sources": names})
         if solved.propagated and not self._brief:
-            found = self._iso(errors)
-            extras = self._extras(solved.fit.residual[:-1].T) | found.as_extras(self._on_axis(errors))
-            attrs = {**observed.attrs, "iso_test": found.test, "iso_temperature_sensor": found.sensor}
+            iso = self._iso(errors)
+            extras = self._extras(solved.fit.residual[:-1].T) | iso.as_extras(self._on_axis(errors))
+            attrs = {**observed.attrs, "iso_test": iso.test, "iso_temperature_sensor": iso.sensor}
             observed = replace(observed, extras=extras, attrs=attrs)
         # The noise is checked by its scatter over time, not by the residuals, of which there are none.
         scatter = replace(solved.scatter, note="")

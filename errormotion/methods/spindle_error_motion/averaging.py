@@ -18,14 +18,14 @@ DRAWS = 3
 
 
 @compiled()
-def interpolated(time: Array, knots: Array, values: Array, slope: Array, found: Array) -> None:
+def interpolated(time: Array, knots: Array, values: Array, slope: Array, result: Array) -> None:
     """Write values at increasing times, between knots by cubic polynomials with these slopes; NaN outside of them."""
     j = max(np.searchsorted(knots, time[0], side="right") - 1, 0) if time.size else 0
     last = knots.size - 2
     for i in range(time.size):
         t = time[i]
         if t < knots[0] or t > knots[last + 1]:
-            found[i] = np.nan
+            result[i] = np.nan
             continue
         while j < last and knots[j + 1] <= t:
             j += 1
@@ -33,7 +33,7 @@ def interpolated(time: Array, knots: Array, values: Array, slope: Array, found: 
         x = (t - knots[j]) / h
         d, m0, m1 = values[j + 1] - values[j], h * slope[j], h * slope[j + 1]
         # Hermite: a + x m0 + x^2 (3 d - 2 m0 - m1) + x^3 (m0 + m1 - 2 d)
-        found[i] = values[j] + x * (m0 + x * (3 * d - 2 * m0 - m1 + x * (m0 + m1 - 2 * d)))
+        result[i] = values[j] + x * (m0 + x * (3 * d - 2 * m0 - m1 + x * (m0 + m1 - 2 * d)))
 
 
 @compiled(inline="always")
@@ -73,7 +73,7 @@ def add_up(
     """
     sensors, n = reading.shape
     batches, parts = count.shape
-    found = 0
+    whole_turns = 0
     for j in range(n):
         u = turn[j]
         if not (u >= 0.0 and u < turns):
@@ -85,7 +85,7 @@ def add_up(
                 good = False
             elif 0 < j < n - 1 and spike(reading[i, j - 1], y, reading[i, j + 1], limit[i]):
                 good = False
-                found += 1
+                whole_turns += 1
         if not good:
             continue
         whole = int(u)
@@ -101,7 +101,7 @@ def add_up(
         square[b, p] += d * d
         for i in range(sensors):
             total[i, b, p] += reading[i, j]
-    return found
+    return whole_turns
 
 
 @compiled()

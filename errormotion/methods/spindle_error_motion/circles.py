@@ -42,8 +42,8 @@ def centre_of(values: Array, angle: Array, circle: str) -> Array:
     else:
         columns, start, right = np.concatenate([[one], round_]), np.array([0, n // 3, 2 * n // 3]), np.eye(3)[0]
         cost = values if circle == "MCC" else -values
-    found = _exchanged(columns, right, cost, start)[:, -2:]
-    return -found if circle == "MIC" else found
+    centre = _exchanged(columns, right, cost, start)[:, -2:]
+    return -centre if circle == "MIC" else centre
 
 
 def _exchanged(columns: Array, right: Array, cost: Array, start: Array) -> Array:

@@ -71,7 +71,7 @@ def curves_of(layout: Layout, angle: Array, sensitive: float) -> list[Curve]:
     """Return the curves that the sensors determine, at angles of the axis (place,), rad."""
     first, second = layout.plane
     names = ["XYZ"[first], "XYZ"[second]]
-    p, found = angle + sensitive, list[Curve]()
+    p, curves = angle + sensitive, list[Curve]()
     one, cos, sin = np.ones(angle.size), np.cos(p), np.sin(p)
 
     def curve(name: str, unit: str, **weight: Array) -> None:
@@ -79,7 +79,7 @@ def curves_of(layout: Layout, angle: Array, sensitive: float) -> list[Curve]:
         for freedom, values in weight.items():
             each[:, int(freedom[1:])] = values
         if layout.determined[[int(freedom[1:]) for freedom in weight]].all():
-            found.append(Curve(name, unit, each))
+            curves.append(Curve(name, unit, each))
 
     i, j, k = f"_{first}", f"_{second}", f"_{layout.along}"
     a, b = f"_{first + 3}", f"_{second + 3}"
@@ -90,7 +90,7 @@ def curves_of(layout: Layout, angle: Array, sensitive: float) -> list[Curve]:
     curve("tilt, rotating", "rad", **{b: cos, a: -sin})
     curve(f"tilt, fixed {names[0]}", "rad", **{b: one})
     curve(f"tilt, fixed {names[1]}", "rad", **{a: -one})
-    return found
+    return curves
 
 
 def centred(values: Array, angle: Array, *, axial: bool) -> Array:
@@ -321,7 +321,7 @@ def structural_of(raw: xr.Dataset, layout: Layout, curves: list[Curve], noise: f
     step = np.linspace(-1, 1, len(reading))
     reading = reading - reading.mean(axis=0)
     reading -= np.multiply.outer(step, step @ reading / (step @ step))
-    generator, found = np.random.default_rng(_SEED), []
+    generator, structural = np.random.default_rng(_SEED), []
     for curve in curves:
         if "rotating" in curve.name:
             continue
@@ -330,8 +330,8 @@ def structural_of(raw: xr.Dataset, layout: Layout, curves: list[Curve], noise: f
         again = [np.ptp(motion + size * generator.standard_normal(motion.size)) for _ in range(DRAWS)]
         value = float(np.ptp(motion))
         values = np.array([value, *_by_noise(value, float(np.mean(again)), size)])
-        found.append((f"structural {curve.name}", curve.unit, values))
-    return found
+        structural.append((f"structural {curve.name}", curve.unit, values))
+    return structural
 
 
 def _by_noise(value: float, noisy: float, noise: float) -> tuple[float, float]:

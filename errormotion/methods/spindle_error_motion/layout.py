@@ -78,16 +78,16 @@ class Layout:
                 f"{length[np.argmax(np.abs(length - 1))]:.4g}",
                 code="sensor.direction.form",
             )
-        found = cls(axis, direction / length[:, None], position - origin, origin, float(raw["artefact_radius"]))
-        if not found.radius > 0:
+        layout = cls(axis, direction / length[:, None], position - origin, origin, float(raw["artefact_radius"]))
+        if not layout.radius > 0:
             raise MethodError(
-                f"artefact_radius: expected a radius above 0; found {found.radius:g}", code="raw.value.not_positive"
+                f"artefact_radius: expected a radius above 0; found {layout.radius:g}", code="raw.value.not_positive"
             )
-        found._check()
-        if found.radial.any() and found.sections.max() == 0:
-            shift = found.position[found.radial][:, found.along].mean() * np.eye(3)[found.along]
-            return cls(axis, found.direction, found.position - shift, origin + shift, found.radius)
-        return found
+        layout._check()
+        if layout.radial.any() and layout.sections.max() == 0:
+            shift = layout.position[layout.radial][:, layout.along].mean() * np.eye(3)[layout.along]
+            return cls(axis, layout.direction, layout.position - shift, origin + shift, layout.radius)
+        return layout
 
     def _check(self) -> None:
         """Refuse sensors that are neither radial nor axial, and radial ones that do not face the artefact."""
@@ -148,13 +148,13 @@ class Layout:
     @cached_property
     def sections(self) -> NDArray[np.intp]:
         """Number of the section of the artefact that each radial sensor looks at, (sensor,); -1 for an axial one."""
-        found, heights = np.full(len(self.direction), -1), list[float]()
+        section, heights = np.full(len(self.direction), -1), list[float]()
         for k in np.flatnonzero(self.radial):
             z = float(self.position[k, self.along])
             near = [j for j, other in enumerate(heights) if abs(z - other) <= SAME_HEIGHT]
-            found[k] = near[0] if near else len(heights)
+            section[k] = near[0] if near else len(heights)
             heights += [] if near else [z]
-        return found
+        return section
 
     @cached_property
     def design(self) -> Array:
@@ -188,9 +188,9 @@ class Layout:
     @cached_property
     def solver(self) -> Array:
         """Freedoms by readings, (6, sensor): least squares with equal weights; 0 for those that are not determined."""
-        found = np.zeros((6, len(self.direction)))
-        found[self.determined] = np.linalg.pinv(self.design[:, self.determined])
-        return found
+        solver = np.zeros((6, len(self.direction)))
+        solver[self.determined] = np.linalg.pinv(self.design[:, self.determined])
+        return solver
 
     def eccentric(self, angle: Array) -> Array:
         """Return error motions that an eccentric and tilted artefact imitates, (g, place, 6).
@@ -199,12 +199,12 @@ class Layout:
         it. Where one direction across the axis is measured only, nothing that occurs once a turn can.
         """
         first, second = self.plane
-        cos, sin, found = np.cos(angle), np.sin(angle), []
+        cos, sin, columns = np.cos(angle), np.sin(angle), []
         for i, j in ((first, second), (first + 3, second + 3)):
             one = self.determined[[i, j]]
             for along, across in ((cos, sin), (-sin, cos)):  # a vector that turns with the spindle
                 each = np.zeros((angle.size, 6))
                 each[:, i], each[:, j] = (along, across) if one.all() else (along * one[0], along * one[1])
                 if one.any():
-                    found.append(each)
-        return np.array(found).reshape(-1, angle.size, 6)
+                    columns.append(each)
+        return np.array(columns).reshape(-1, angle.size, 6)

@@ -96,7 +96,7 @@ class SpindleErrorMotion(ModelMethod):
         """Return the values of ISO 230-7 with U, which contains the bias of an extreme value (JCGM 100, F.2.4.5)."""
         from errormotion.estimation.extremes import expanded
 
-        sources, found = errors["source"].values.tolist(), []
+        sources, merits = errors["source"].values.tolist(), []
         U = expanded(errors["figure_bias"].values, errors["figure_u"].values)
         for k, name in enumerate(errors["figure"].values.tolist()):
             limit = None
@@ -105,8 +105,8 @@ class SpindleErrorMotion(ModelMethod):
                 limit = None if limit is None or "tilt" in name else float(limit)
             effect = dict(zip(sources, errors["figure_influence"].values[:, k].tolist(), strict=True))
             value, unit = float(errors["figure_value"][k]), str(errors["figure_unit"].values[k])
-            found.append(FigureOfMerit(name, value, float(U[k]), unit, limit, effect))
-        return found
+            merits.append(FigureOfMerit(name, value, float(U[k]), unit, limit, effect))
+        return merits
 
 
 @lru_cache(maxsize=4)

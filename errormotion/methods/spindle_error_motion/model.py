@@ -274,7 +274,7 @@ def _finished(solved: Solved, *, record: Record) -> Solved:
     spread = spread_of(record.raw, record.layout, record.turning, record.mean, curves, noise)
     value = np.nan_to_num(errors.value)
     gains, scatter = (np.array([source.group == group for source in errors.sources]) for group in (GAIN, MOTION))
-    found = figures_of(
+    values = figures_of(
         curves,
         angle,
         value,
@@ -296,12 +296,12 @@ def _finished(solved: Solved, *, record: Record) -> Solved:
     )
     over, meaning = ("curve", "angle"), "of each sensitive direction, m or rad"
     extras = {
-        "figure_value": _array({"figure": found.names}, ("figure",), found.value, "values of ISO 230-7, m or rad"),
-        "figure_bias": _array({"figure": found.names}, ("figure",), found.bias, "typical excess by noise, m or rad"),
-        "figure_u": _array({"figure": found.names}, ("figure",), found.u, "standard uncertainty without the bias"),
-        "figure_unit": _array({"figure": found.names}, ("figure",), np.array(found.units), "unit of each figure"),
+        "figure_value": _array({"figure": values.names}, ("figure",), values.value, "values of ISO 230-7, m or rad"),
+        "figure_bias": _array({"figure": values.names}, ("figure",), values.bias, "typical excess by noise, m or rad"),
+        "figure_u": _array({"figure": values.names}, ("figure",), values.u, "standard uncertainty without the bias"),
+        "figure_unit": _array({"figure": values.names}, ("figure",), np.array(values.units), "unit of each figure"),
         "figure_influence": _array(
-            {"figure": found.names}, ("source", "figure"), found.influence, "effect of each source, m or rad"
+            {"figure": values.names}, ("source", "figure"), values.influence, "effect of each source, m or rad"
         ),
         "synchronous": _array({"curve": names}, over, mean, f"synchronous error motion {meaning}"),
         "synchronous_u": _array({"curve": names}, over, u, f"standard uncertainty {meaning}"),

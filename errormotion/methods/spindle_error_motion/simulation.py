@@ -190,8 +190,8 @@ def truth_of(
     zero = {
         name: 0.0 * errors[name] for name in ("covariance", "influence", "figure_influence", "figure_u", "figure_bias")
     }
-    found = errors.assign(zero)
-    found = found.assign({dof: errors[dof].copy(data=true[:, k]) for k, dof in enumerate(DOF)})
+    truth = errors.assign(zero)
+    truth = truth.assign({dof: errors[dof].copy(data=true[:, k]) for k, dof in enumerate(DOF)})
     names = errors["figure"].values.tolist()
     figures = errors["figure_value"].copy(data=[values[name] for name in names])
-    return found.assign(figure_value=figures).assign_attrs(notes=[], machine="simulated")
+    return truth.assign(figure_value=figures).assign_attrs(notes=[], machine="simulated")

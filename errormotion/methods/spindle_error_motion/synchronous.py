@@ -139,21 +139,21 @@ def synchronous_of(raw: xr.Dataset, turning: Turning, wanted: int) -> Synchronou
     middle = (np.arange(parts) + 0.5 + offset / np.maximum(count, 1)) * TAU / parts
     means = total / np.maximum(count, 1)
     variance = np.maximum(variance, 0.0) * (TAU / parts) ** 2
-    found = _fitted(count, middle, variance, means, turning.turns, wanted, limit, spikes, seen)
-    return _with_rounding(found, step, float(raw["displacement_noise"]), turning.turns)
+    fitted = _fitted(count, middle, variance, means, turning.turns, wanted, limit, spikes, seen)
+    return _with_rounding(fitted, step, float(raw["displacement_noise"]), turning.turns)
 
 
 def limits(reading: Array) -> Array:
     """Return the distance of spikes from their neighbours, (sensor,), m; infinite where they are no accidents."""
-    found = np.full(len(reading), np.inf)
+    largest = np.full(len(reading), np.inf)
     for i, (before, value, after) in enumerate(zip(reading[:, :-2], reading[:, 1:-1], reading[:, 2:], strict=True)):
         d = np.abs(value - (before + after) / 2)
         known = np.isfinite(d)
         if known.sum() > FEWEST_READINGS:
             limit = SPIKE * float(scale_about_zero(d[known]))
             if limit > 0 and np.mean((d > limit) & (np.abs(after - before) < d / 2)) < SPIKES:
-                found[i] = limit
-    return found
+                largest[i] = limit
+    return largest
 
 
 def _fitted(
@@ -191,13 +191,13 @@ def _fitted(
         )
     if not kept.all():
         notes.append(f"{(~kept).sum()} of {kept.size} batches of turns have gaps and are not used.")
-    found = np.zeros((len(count), 2 * K + 1, len(means)))
+    coefficients = np.zeros((len(count), 2 * K + 1, len(means)))
     for b in np.flatnonzero(kept):
         there = count[b] > 0
         design = harmonics_at(middle[b, there], K, variance[b, there])
         weighted = design * count[b, there, None]
-        found[b] = np.linalg.solve(design.T @ weighted, weighted.T @ means[:, b, there].T)
-    used = found[kept]
+        coefficients[b] = np.linalg.solve(design.T @ weighted, weighted.T @ means[:, b, there].T)
+    used = coefficients[kept]
     batches = len(used)
     slow = _lingering(used)
     if slow > _LINGERING:
@@ -206,7 +206,7 @@ def _fitted(
             "frequency nearly is a multiple of the speed. The uncertainty of the mean over turns is increased by a "
             f"factor of {np.sqrt(slow):.1f}; a longer record separates them."
         )
-    level = np.where(kept[:, None], found[:, 0], np.nan)
+    level = np.where(kept[:, None], coefficients[:, 0], np.nan)
     notes += _leftover(used, count[kept], middle[kept], variance[kept], means[:, kept])
     valid = int(count[kept].sum())
     missing = seen - int(count.sum()) - spikes
@@ -219,28 +219,28 @@ def _fitted(
     return Synchronous(used, levels, factor, valid, limit, spikes, max(missing, 0), none, none, notes, doubts)
 
 
-def _with_rounding(found: Synchronous, step: Array, noise: float, turns: int) -> Synchronous:
+def _with_rounding(synchronous: Synchronous, step: Array, noise: float, turns: int) -> Synchronous:
     """Return the mean with what rounding adds: alike in all turns, and independent from angle to angle.
 
     The scatter from turn to turn, which averages rounding out, is at least the noise of a sensor and the scatter of the
     batches at one angle. Neighbouring angles are rounded differently, by the eccentricity.
     """
     if not step.any():
-        return found
-    batches = len(found.coefficient)
-    scatter = found.coefficient[:, 1:].var(axis=0, ddof=1).sum(axis=0) / 2 * turns / batches
+        return synchronous
+    batches = len(synchronous.coefficient)
+    scatter = synchronous.coefficient[:, 1:].var(axis=0, ddof=1).sum(axis=0) / 2 * turns / batches
     before = np.hypot(noise, np.sqrt(scatter))
     alike = np.array([float(common(float(q), s)) for q, s in zip(step, before, strict=True)])
-    each = max(found.count / turns, 1.0)  # samples in a turn
-    rounded = alike * np.sqrt(np.minimum((2 * found.harmonics + 1) / each, 1.0))
-    notes = list(found.notes)
+    each = max(synchronous.count / turns, 1.0)  # samples in a turn
+    rounded = alike * np.sqrt(np.minimum((2 * synchronous.harmonics + 1) / each, 1.0))
+    notes = list(synchronous.notes)
     if (alike > 0.1 * step).any():
         words = ", ".join(f"sensor {i + 1} by {1e9 * q:.3g} nm" for i, q in enumerate(step) if q > 0)
         notes.append(
             f"The readings are rounded ({words}), with less motion from turn to turn than that: rounding is a part of "
             "the uncertainties."
         )
-    return replace(found, step=step, rounded=rounded, notes=notes)
+    return replace(synchronous, step=step, rounded=rounded, notes=notes)
 
 
 def _gap(angle: Array) -> float:
@@ -296,7 +296,7 @@ def _leftover(used: Array, count: NDArray[np.int64], middle: Array, variance: Ar
     known = number >= FEWEST_BATCHES
     if known.sum() < groups / 2:
         return []
-    found = []
+    texts = []
     for i, each in enumerate(total / np.maximum(weight, 1)):
         mean = each.sum(axis=0) / np.maximum(number, 1)
         off = np.where(seen, each - mean, 0.0)
@@ -304,10 +304,10 @@ def _leftover(used: Array, count: NDArray[np.int64], middle: Array, variance: Ar
         square, expected = float(np.square(mean[known]).mean()), float(scatter[known].mean())
         size = np.sqrt(max(square - expected, 0.0))
         if square > expected * (1 + 8 * np.sqrt(2 / known.sum())) and size > 1e-9:
-            found.append(f"{1e9 * size:.2g} nm (sensor {i + 1})")
-    if not found:
+            texts.append(f"{1e9 * size:.2g} nm (sensor {i + 1})")
+    if not texts:
         return []
     return [
-        f"Motions with more than {K} undulations in one turn repeat from turn to turn: {', '.join(found)}, root mean "
+        f"Motions with more than {K} undulations in one turn repeat from turn to turn: {', '.join(texts)}, root mean "
         "square. They are no part of the synchronous error motion; increase harmonics."
     ]

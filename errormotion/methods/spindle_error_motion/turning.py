@@ -59,9 +59,9 @@ class Turning:
     def at(self, time: Array) -> Array:
         """Return the angles at increasing times, rad, from the start of the first whole turn; NaN outside the knots."""
         slope = np.gradient(self.angles, self.knots)  # second order, also for uneven knots
-        found = np.empty(time.size)
-        interpolated(time, self.knots, self.angles, slope, found)
-        return found
+        angle = np.empty(time.size)
+        interpolated(time, self.knots, self.angles, slope, angle)
+        return angle
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +124,18 @@ def turning_of(raw: xr.Dataset, layout: Layout, notes: list[str]) -> Turning:
             code="spindle.speed.zero",
         )
     if "angle" in raw:
-        found = _by_encoder(raw, speed)
+        turning = _by_encoder(raw, speed)
     elif "index_time" in raw:
-        found = _by_index(np.asarray(raw["index_time"].values, float), speed, notes)
+        turning = _by_index(np.asarray(raw["index_time"].values, float), speed, notes)
     else:
-        found = _by_eccentricity(raw, layout, speed, notes)
-    if found.turns < FEWEST_TURNS:
+        turning = _by_eccentricity(raw, layout, speed, notes)
+    if turning.turns < FEWEST_TURNS:
         raise MethodError(
-            f"The record has {found.turns} whole turns; expected at least {FEWEST_TURNS}, and 20 or more for the "
+            f"The record has {turning.turns} whole turns; expected at least {FEWEST_TURNS}, and 20 or more for the "
             "asynchronous error motion.",
             code="spindle.turns.too_few",
         )
-    return found
+    return turning
 
 
 def _by_encoder(raw: xr.Dataset, speed: float) -> Turning:
@@ -162,12 +162,12 @@ def _by_encoder(raw: xr.Dataset, speed: float) -> Turning:
 
 def unwrapped(angle: Array, before: float) -> Array:
     """Return the angles of an encoder without jumps of whole turns, continued from an angle before them."""
-    found = np.full(angle.shape, np.nan)
+    turns = np.full(angle.shape, np.nan)
     known = np.isfinite(angle)
     each = angle[known] if np.isnan(before) else np.append(before, angle[known])
     whole = np.unwrap(each)
-    found[known] = whole if np.isnan(before) else whole[1:]
-    return found
+    turns[known] = whole if np.isnan(before) else whole[1:]
+    return turns
 
 
 def _by_index(pulse: Array, speed: float, notes: list[str]) -> Turning:
@@ -265,7 +265,7 @@ def _frequency(raw: xr.Dataset, radial: NDArray[np.intp], nominal: float) -> flo
 
 def _phasors(raw: xr.Dataset, radial: NDArray[np.intp], frequency: float) -> tuple[Array, Array, Array]:
     """Return times (block,), complex amplitudes (block, sensor), and mean squares of the rest (block, sensor)."""
-    times, found, rest = [], [], []
+    times, phasors, rest = [], [], []
     kept_time, kept = np.zeros(0), np.zeros((radial.size, 0))
     for chunk in chunks(raw):
         time, y = np.append(kept_time, chunk.time), np.concatenate([kept, chunk.reading[radial]], axis=1)
@@ -276,18 +276,18 @@ def _phasors(raw: xr.Dataset, radial: NDArray[np.intp], frequency: float) -> tup
             middle = float(t.mean())
             times.append(middle)
             if its.sum() < 8:
-                found.append(np.full(radial.size, np.nan + 0j))
+                phasors.append(np.full(radial.size, np.nan + 0j))
                 rest.append(np.full(radial.size, np.nan))
                 continue
             phase = TAU * frequency * (t[its] - middle)
             design = np.stack([np.ones(phase.size), phase, np.cos(phase), np.sin(phase)], axis=1)
             a, *_ = np.linalg.lstsq(design, each[:, its].T, rcond=None)
             # cos(phase + p) = cos p cos phase - sin p sin phase
-            found.append(a[2] - 1j * a[3])
+            phasors.append(a[2] - 1j * a[3])
             rest.append(np.mean(np.square(each[:, its].T - design @ a), axis=0))
         done = time.size // n * n
         kept_time, kept = time[done:], y[:, done:]
-    return np.array(times), np.array(found).reshape(-1, radial.size), np.array(rest).reshape(-1, radial.size)
+    return np.array(times), np.array(phasors).reshape(-1, radial.size), np.array(rest).reshape(-1, radial.size)
 
 
 def angles_of(chunk: Chunk, turning: Turning, before: float) -> tuple[Array, float]:

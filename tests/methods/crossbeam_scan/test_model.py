@@ -214,8 +214,8 @@ def test_influence_of_every_source_equals_a_solution_with_changed_values(gantry,
 
 def test_artefact_and_mount_that_expand_displace_the_surface_by_their_length(gantry, rig):
     of = campaign(registrations(true_maps(gantry.crossbeam)), rig, strains=STRAINS, height=0.08)
-    found = carriage(of.found, rig, strains=STRAINS, height=0.08)
-    flat = carriage(of.found, rig, strains=STRAINS, height=0.0)
+    found = carriage(of.registrations, rig, strains=STRAINS, height=0.08)
+    flat = carriage(of.registrations, rig, strains=STRAINS, height=0.0)
     grown = found.influence[model.EXPANSION].sum(axis=0) - flat.influence[model.EXPANSION].sum(axis=0)
     # 20 um/m of 80 mm, along the line of sight. The strain of a larger warm artefact is negative: it makes it as
     # small as the cold one. With a larger strain, more of the reading is not a motion of the profiler.

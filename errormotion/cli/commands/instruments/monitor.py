@@ -79,14 +79,14 @@ class Screen:
     def __init__(self, sensors: tuple[str, ...]) -> None:
         self._first: dict[str, float] = {}
         self._extremes: dict[str, tuple[float, float]] = {}
-        self._course: dict[str, deque[tuple[float, float]]] = {name: deque(maxlen=TREND) for name in sensors}
+        self._history: dict[str, deque[tuple[float, float]]] = {name: deque(maxlen=TREND) for name in sensors}
 
     def take(self, snapshot: Snapshot) -> None:
         """Add the temperatures of a snapshot."""
         for name, value in snapshot.temperatures.items():
-            course = self._course[name]
-            if not course or snapshot.time - course[-1][0] >= SPAN / TREND:
-                course.append((snapshot.time, value))
+            history = self._history[name]
+            if not history or snapshot.time - history[-1][0] >= SPAN / TREND:
+                history.append((snapshot.time, value))
             if math.isnan(value):
                 continue
             self._first.setdefault(name, value)
@@ -95,7 +95,7 @@ class Screen:
 
     def rate(self, name: str, snapshot: Snapshot) -> float:
         """Return the rate of change of a temperature, K/h; NaN while it is unknown."""
-        known = [(t, value) for t, value in self._course[name] if not math.isnan(value)]
+        known = [(t, value) for t, value in self._history[name] if not math.isnan(value)]
         value = snapshot.temperatures[name]
         if not known or math.isnan(value) or snapshot.time <= known[0][0]:
             return math.nan
@@ -134,7 +134,7 @@ class Screen:
                 _number(self.rate(name, snapshot), "+.2f"),
                 _number(low, ".2f"),
                 _number(high, ".2f"),
-                bars([value for _, value in self._course[name]], MIN_SPAN),
+                bars([value for _, value in self._history[name]], MIN_SPAN),
             )
         return table
 

@@ -67,20 +67,20 @@ def observe(raw: xr.Dataset, settings: BeamDirectionSettings, sensor: Sensor | N
         scale_identity=certified(raw.attrs, {SCALE: ("sensor", "gain")}).get(SCALE, ""),
     )
     plain = solve(exact, data.nominal_direction)
-    found = plain
+    detected = plain
     if sensor is None:
         notes.append("No inclination compensation: the readings are not corrected for the inclination error.")
     else:
         notes += sensor.notes
-        found = solve(replace(exact, sensor=sensor, mid_range=sensor.mid_range), data.nominal_direction, plain.roots)
-        _check_slopes(found.state, data)
-    beam = found.adjusted()
+        detected = solve(replace(exact, sensor=sensor, mid_range=sensor.mid_range), data.nominal_direction, plain.roots)
+        _check_slopes(detected.state, data)
+    beam = detected.adjusted()
     closed = fit(beam.problem())
     beam = beam.started(closed.unknowns)
     if sensor is not None:
-        check_receiver(found, closed, notes)
+        check_receiver(detected, closed, notes)
     beam = _with_points(beam, closed, data, notes)
-    _note_roots(found, data, notes)
+    _note_roots(detected, data, notes)
     p0 = data.nominal_origin
     result = _Result(raw, settings, data, beam, plain.state.direction)
     return Observed(
@@ -169,17 +169,17 @@ _LOOSE = 1e-3
 """Standard deviation of points with which the planes alone determine the direction, m."""
 
 
-def _note_roots(found: Direction, data: Readings, notes: list[str]) -> None:
-    u = found.state.direction
-    if found.other_root is not None:
-        other, u0 = found.other_root, data.nominal_direction
+def _note_roots(detected: Direction, data: Readings, notes: list[str]) -> None:
+    u = detected.state.direction
+    if detected.other_root is not None:
+        other, u0 = detected.other_root, data.nominal_direction
         angles = [float(np.degrees(np.arccos(np.clip(v @ u0, -1, 1)))) for v in (u, other)]
         notes.append(
             f"Two directions fit the planes; the one closer to nominal, at {angles[0]:.3g} deg, is used. The other one "
             "is ({:.5f}, {:.5f}, {:.5f}), at ".format(*other)
             + f"{angles[1]:.3g} deg."
         )
-    if found.curvature > _NOTED_CURVATURE:
+    if detected.curvature > _NOTED_CURVATURE:
         notes.append(
             "The beam is near the plane of the normals of the planes: its uncertainty is large compared with the "
             "distance of the two possible directions, and intervals are approximate. Measure a plane tilted about "
@@ -323,10 +323,10 @@ def closures(beam: Beam, solved: Solved, state: State) -> tuple[Array, Array]:
     k = len(beam.planes.names)
     if k < 3:
         return np.zeros(k), np.zeros(k)
-    found, u = solved.fit, state.direction
+    closed, u = solved.fit, state.direction
     closure = beam.planes.gradients @ u / state.factor + 1
-    root = np.linalg.inv(found.linear.whitener)
-    left = root @ (np.eye(4) - found.hat) @ np.swapaxes(root, 1, 2)
+    root = np.linalg.inv(closed.linear.whitener)
+    left = root @ (np.eye(4) - closed.hat) @ np.swapaxes(root, 1, 2)
     variance = np.einsum("i,kij,j->k", u, left[:, :3, :3], u) / np.square(state.factor)
     estimated = solved.scatter.factor if solved.fit_factor == 1.0 else 1.0
     return closure, np.sqrt(np.maximum(variance, 0.0) / estimated)

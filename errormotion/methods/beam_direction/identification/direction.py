@@ -97,9 +97,9 @@ def solve(beam: Beam, nominal: Array, starts: Sequence[Array] = ()) -> Direction
     roots = list[Direction]()
     starts = starts or _starts(beam.planes, nominal)
     for start in starts:
-        found = near(beam, start)
-        if found is not None and all(_angle(found.state.direction, o.state.direction) > _SAME for o in roots):
-            roots.append(found)
+        first = near(beam, start)
+        if first is not None and all(_angle(first.state.direction, o.state.direction) > _SAME for o in roots):
+            roots.append(first)
     if not roots:
         raise _merged(starts[0])
     roots.sort(key=lambda root: -float(root.state.direction @ nominal))
@@ -143,14 +143,14 @@ def near(beam: Beam, start: Array) -> Direction | None:
     """Return the direction near a start (3,); None if the planes do not determine it there."""
     beam = replace(beam, about=start)
     try:
-        found = fit(beam.problem(), what="the planes")
+        solution = fit(beam.problem(), what="the planes")
     except FitError:
         return None
-    state = beam.state(found.unknowns, found.constants)
+    state = beam.state(solution.unknowns, solution.constants)
     u, S = state.direction, beam.planes.covariance[:, :3, :3]
     conditions = float(np.sum(1 / np.einsum("i,kij,j->k", u, S, u)))
-    curvature = 0.5 * float(np.linalg.eigvalsh(beam.direction_covariance(found))[-1]) * float(np.sqrt(conditions))
-    return Direction(replace(beam, about=u), found, state, None, curvature)
+    curvature = 0.5 * float(np.linalg.eigvalsh(beam.direction_covariance(solution))[-1]) * float(np.sqrt(conditions))
+    return Direction(replace(beam, about=u), solution, state, None, curvature)
 
 
 def _starts(planes: Planes, nominal: Array) -> tuple[Array, Array]:

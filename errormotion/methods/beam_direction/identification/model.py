@@ -227,10 +227,10 @@ class Beam:
 
         return Places(parameters, 1)
 
-    def direction_covariance(self, found: Fit) -> Array:
+    def direction_covariance(self, solution: Fit) -> Array:
         """Return the covariance (3, 3) of the direction of a fit of this problem."""
-        root = found.normal.root[found.linear.numbering.border[0].ravel()]
-        v = self.about + found.unknowns.beam[0] @ self.basis
+        root = solution.normal.root[solution.linear.numbering.border[0].ravel()]
+        v = self.about + solution.unknowns.beam[0] @ self.basis
         u = v / np.linalg.norm(v)
         by_angles = (self.basis - np.outer(self.basis @ u, u)) / np.linalg.norm(v)
         return np.asarray(by_angles.T @ root @ root.T @ by_angles)

@@ -206,8 +206,8 @@ def _check_order(name: str, stage: Array) -> None:
     if len(moving) < 3:
         return
     d, size = steps[moving] / size[moving, None], size[moving]
-    turns = np.sum(d[1:] * d[:-1], axis=1) < -_REVERSAL_COSINE
-    wrong = turns[:-1] & turns[1:] & (size[1:-1] < 0.9 * np.minimum(size[:-2], size[2:]))
+    reverses = np.sum(d[1:] * d[:-1], axis=1) < -_REVERSAL_COSINE
+    wrong = reverses[:-1] & reverses[1:] & (size[1:-1] < 0.9 * np.minimum(size[:-2], size[2:]))
     if wrong.any():
         at = int(np.argmax(wrong)) + 1
         raise MethodError(

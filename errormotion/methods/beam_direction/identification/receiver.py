@@ -24,12 +24,12 @@ _NOTED = 2.0
 """Standard uncertainties of the direction from which on the effect of the side is noted."""
 
 
-def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
+def check_receiver(detected: Direction, closed: Fit, notes: list[str]) -> None:
     """Refuse a stated side of the receiver that the planes contradict; note one that they do not confirm.
 
     Parameters
     ----------
-    found : Direction
+    detected : Direction
         With exact constants.
     closed : Fit
         With adjusted constants and without known points.
@@ -40,15 +40,15 @@ def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
     MethodError
         The planes contradict one another with the stated side, and agree with the opposite one.
     """
-    sensor, u = found.beam.sensor, found.state.direction
+    sensor, u = detected.beam.sensor, detected.state.direction
     if sensor is None:
         return
     opposite = replace(sensor, triangulation_normal=-sensor.triangulation_normal)
-    other = near(replace(found.beam, sensor=opposite), u)
+    other = near(replace(detected.beam, sensor=opposite), u)
     if other is None:  # no beam fits with the opposite side
         return
     mirrored = _adjusted_chi2(other)
-    freedom = len(found.beam.planes.names) - 2
+    freedom = len(detected.beam.planes.names) - 2
     limit = float(chdtri(freedom, FALSE_ALARM)) if freedom > 0 else np.inf
     if closed.chi2 > limit >= mirrored:
         raise MethodError(
@@ -59,7 +59,7 @@ def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
             code="beam.receiver.contradicted",
         )
     turned = float(np.linalg.norm(other.state.direction - u))
-    deviation = float(np.sqrt(np.linalg.eigvalsh(found.beam.direction_covariance(closed))[-1]))
+    deviation = float(np.sqrt(np.linalg.eigvalsh(detected.beam.direction_covariance(closed))[-1]))
     if mirrored <= limit and turned > _NOTED * deviation:
         notes.append(
             f"The planes do not show on which side of the laser the receiver is; the stated side is used. With the "
@@ -69,12 +69,12 @@ def check_receiver(found: Direction, closed: Fit, notes: list[str]) -> None:
         )
 
 
-def _adjusted_chi2(found: Direction) -> float:
+def _adjusted_chi2(detected: Direction) -> float:
     """Return chi-square with constants that the readings improve, to first order about exact ones.
 
     With the wrong side they are improved by many standard uncertainties, where the equations bend.
     """
-    problem = found.adjusted().started(found.fit.unknowns._replace(beam=np.zeros((1, 2)))).problem()
+    problem = detected.adjusted().started(detected.fit.unknowns._replace(beam=np.zeros((1, 2)))).problem()
     linear = linearised(problem, problem.start)
     normal, a, b = linear.normal()
     x, z = normal.solve(a[..., None], b[..., None])

@@ -76,8 +76,8 @@ def plan(method: ModelMethod, settings: BeamDirectionSettings) -> xr.Dataset:
     best = pair if number == 2 else design.optimise(limits, _angles(settings))
     setups = (design.equal_strokes(np.array(PUBLISHED), limits), stated, pair, best)
     results = [solved_setup(setup, settings) for setup in setups]
-    angles = np.array([_larger_u(found.relative.errors.covariance[0], limits) for found in results])
-    by_noise = np.array([_larger_u(found.relative.errors.own[0], limits) for found in results])
+    angles = np.array([_larger_u(planned_result.relative.errors.covariance[0], limits) for planned_result in results])
+    by_noise = np.array([_larger_u(planned_result.relative.errors.own[0], limits) for planned_result in results])
     plane = ("best_plane",)
     extras = {
         "angle_uncertainty": xr.DataArray(angles, dims="setup", attrs={"units": "rad"}),

@@ -149,12 +149,12 @@ class _Job:
 
 def _text(cold: BlockMap, warm: BlockMap, raw: xr.Dataset) -> str:
     """Return the errors of the carriage with the standard uncertainty of the registration, in um and arcsec."""
-    found = register(cold, warm, point=np.zeros(3))
+    registration = register(cold, warm, point=np.zeros(3))
     pose = RigidTransform.from_matrix(np.asarray(raw["profiler_pose"].values, dtype=float))
-    errors, covariance = carriage_errors(found.twist, found.covariance, Rig(pose, raw["lever"].values))
+    errors, covariance = carriage_errors(registration.twist, registration.covariance, Rig(pose, raw["lever"].values))
     size = np.sqrt(np.diag(covariance))
     shown = [f"E{k} {v * 1e6:+.1f} ({u * 1e6:.2f})" for k, v, u in zip("XYZ", errors, size, strict=False)]
-    turns = [
+    rotations = [
         f"E{k} {v * _ARCSEC:+.2f} ({u * _ARCSEC:.2f})" for k, v, u in zip("ABC", errors[3:], size[3:], strict=True)
     ]
-    return f"{' '.join(shown)} um, {' '.join(turns)} arcsec"
+    return f"{' '.join(shown)} um, {' '.join(rotations)} arcsec"

@@ -74,13 +74,13 @@ def record_pocket(bench: Bench, settings: CrossbeamScanSettings, done: xr.Datase
             continue
         stage = np.zeros((1, y.size, 3))
         stage[0, :, 1], stage[0, :, 2] = y, settings.pocket_lifts[number]
-        found = static.assign(
+        chunk = static.assign(
             x=("point", x, {"units": "m"}),
             height=(("scan", "profile", "point"), heights[None], {"units": "m"}),
             stage=(("scan", "profile", "direction"), stage, {"units": "m"}),
         )
-        found.attrs |= counts
-        yield found
+        chunk.attrs |= counts
+        yield chunk
 
 
 def require_streaming(profiler: Any) -> None:

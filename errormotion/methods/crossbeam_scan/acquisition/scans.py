@@ -116,7 +116,7 @@ def static_part(bench: Bench, settings: CrossbeamScanSettings, plan: Schedule, p
     )
 
 
-def pose_of(settings: CrossbeamScanSettings, found: xr.Dataset | None) -> tuple[Array, Array]:
+def pose_of(settings: CrossbeamScanSettings, pose: xr.Dataset | None) -> tuple[Array, Array]:
     """Return pose (4, 4) of the profiler in the tool frame and its covariance (6, 6), from a test or the settings.
 
     Raises
@@ -124,8 +124,8 @@ def pose_of(settings: CrossbeamScanSettings, found: xr.Dataset | None) -> tuple[
     MethodError
         Neither states it.
     """
-    if found is not None:
-        return np.asarray(found["profiler_pose"].values, float), np.asarray(found["pose_covariance"].values, float)
+    if pose is not None:
+        return np.asarray(pose["profiler_pose"].values, float), np.asarray(pose["pose_covariance"].values, float)
     stated = settings.profiler_pose
     if stated is None:
         raise MethodError(
@@ -391,11 +391,11 @@ class Pending:
     def chunk(self) -> xr.Dataset:
         """Return all pending lines as a dataset."""
         units = {"record": "m", "line_time": "s", "line_clock": "s"}
-        found: dict[str, Any] = {"x": ("point", self.x, {"units": "m"})}
+        variables: dict[str, Any] = {"x": ("point", self.x, {"units": "m"})}
         for name, parts in self._parts.items():
             dims = ("line", "point") if name == "record" else ("line",)
-            found[name] = (dims, np.concatenate(parts), {"units": units[name]} if name in units else {})
-        ds = self.static.assign(found)
+            variables[name] = (dims, np.concatenate(parts), {"units": units[name]} if name in units else {})
+        ds = self.static.assign(variables)
         ds.attrs |= {"dropped": self.dropped, "invalid": dict(self.invalid)}
         self._parts, self.lines, self.dropped, self.invalid = {}, 0, 0, {}
         self._since = time.monotonic()

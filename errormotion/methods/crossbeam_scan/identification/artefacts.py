@@ -113,9 +113,9 @@ def _cold_notes(twist: Array, covariance: Array, positions: Array, repeatability
     return notes
 
 
-def _moved_notes(found: Consistency, positions: Array, time: Array, excluded: bool) -> list[str]:
+def _moved_notes(consistency: Consistency, positions: Array, time: Array, excluded: bool) -> list[str]:
     notes = []
-    for one in found.moved:
+    for one in consistency.moved:
         shift, turn = _size(one.step)
         notes.append(
             f"The artefact at {positions[one.artefact]:g} m moved before the scan at {time[one.since] / 60:.1f} min, "
@@ -403,7 +403,7 @@ def _most_significant(
     inverse = np.linalg.inv(V / np.outer(unit, unit)) / np.outer(unit, unit)
     pull = (inverse @ deviation.ravel()).reshape(-1, 6)
     model_share = (model_variance / (unit**2).reshape(-1, 6)) ** 2
-    found = []
+    candidates = []
     for i, since in enumerate(cycles):
         block = slice(6 * i, 6 * i + 6)
         normal = inverse[block, block]
@@ -413,8 +413,8 @@ def _most_significant(
         score = float(step @ pull[i])
         weight = np.abs(step * pull[i])
         total = degrees[i] * weight.sum() / max(float(weight @ model_share[i]), 1e-9 * float(weight.sum()))
-        found.append(Moved(k, int(since), step, covariance, score, float(special.fdtrc(6, total, score / 6))))
-    return max(found, key=lambda step: step.score)
+        candidates.append(Moved(k, int(since), step, covariance, score, float(special.fdtrc(6, total, score / 6))))
+    return max(candidates, key=lambda step: step.score)
 
 
 def _checked(

@@ -68,8 +68,8 @@ def interruptions(raw: xr.Dataset) -> list[Interruption]:
     """Return the interrupted passes that a raw dataset states."""
     counts = raw.attrs.get("invalid", "{}")
     counts = json.loads(counts) if isinstance(counts, str) else counts
-    found = [_INTERRUPTION.fullmatch(str(text)) for text in counts]
-    return [Interruption(int(m[1]), float(m[2]), m[3]) for m in found if m is not None]
+    matches = [_INTERRUPTION.fullmatch(str(text)) for text in counts]
+    return [Interruption(int(m[1]), float(m[2]), m[3]) for m in matches if m is not None]
 
 
 class Scans:
@@ -158,7 +158,7 @@ class _Record:
         self._time = np.asarray(raw["line_time"].values, dtype=float)
         planned = int(raw.sizes["cycle"]) if "warm_up" in raw else 0
         self.cycles = max(planned, int(self._cycle.max(initial=-1)) + 1)
-        self._broken = {found.cycle: found for found in interruptions(raw)}
+        self._broken = {stop.cycle: stop for stop in interruptions(raw)}
         self._check_units()
 
     def _check_units(self) -> None:

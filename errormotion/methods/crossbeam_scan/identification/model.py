@@ -78,7 +78,7 @@ class Campaign:
 
     Attributes
     ----------
-    found : Registrations
+    registrations : Registrations
         Of these cycles; of the first, only which artefacts have a reference is used.
     positions : ndarray, (artefact,)
         Of the axis, m, increasing.
@@ -92,7 +92,7 @@ class Campaign:
         Of the surfaces above the plane on which the artefacts stand, m.
     """
 
-    found: Registrations
+    registrations: Registrations
     positions: Array
     rig: Rig
     guide: float | None
@@ -102,13 +102,13 @@ class Campaign:
     @property
     def shape(self) -> tuple[int, int]:
         """Numbers of cycles and artefacts."""
-        cycles, artefacts = self.found.cold_share.shape
+        cycles, artefacts = self.registrations.cold_share.shape
         return cycles, artefacts
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
         """Which registrations are known, (cycle, artefact), the cold ones excluded."""
-        known = np.asarray(np.isfinite(self.found.twist[..., 0]))
+        known = np.asarray(np.isfinite(self.registrations.twist[..., 0]))
         known[0] = False
         return known
 
@@ -116,7 +116,7 @@ class Campaign:
     def determined(self) -> NDArray[np.bool_]:
         """Which errors are known, (cycle, artefact)."""
         known = self.known.copy()
-        known[0] = self.found.cold >= 0
+        known[0] = self.registrations.cold >= 0
         return known
 
     def observed(self, **attributes: Any) -> Observed:
@@ -147,10 +147,10 @@ class Campaign:
         n = cycles * artefacts
         at, known = np.arange(n), self.known.ravel()
         rows = at if self.guide is None else at[:, None] // artefacts * artefacts + np.arange(artefacts)
-        C = self.found.covariance.reshape(n, 9, 9)[:, :6, :6].copy()
+        C = self.registrations.covariance.reshape(n, 9, 9)[:, :6, :6].copy()
         C[~known] = C[np.argmax(known)] if known.any() else np.eye(6)  # has no effect
-        share = np.where(known, self.found.cold_share.ravel(), 0.0)
-        readings = np.where(known[:, None], self.found.twist.reshape(n, 9)[:, :6], np.nan)
+        share = np.where(known, self.registrations.cold_share.ravel(), 0.0)
+        readings = np.where(known[:, None], self.registrations.twist.reshape(n, 9)[:, :6], np.nan)
         root = _root(C)
         noise = np.sqrt(1.0 - share)[:, None, None] * root
         if self.guide is not None:
@@ -227,9 +227,9 @@ class Campaign:
         of_twist = self._of_twist(c)
         rows = x.twist.reshape(len(y), -1, 6)
         strain = np.concatenate([c.scale, c.expansion, c.mount], axis=1)
-        found: Array = y - np.einsum("nmwi,nwi->nm", of_twist, rows)
-        found[:, :6] -= c.cold + np.einsum("nij,nj->ni", self.effect.reshape(-1, 6, 4), strain)
-        return found
+        residuals: Array = y - np.einsum("nmwi,nwi->nm", of_twist, rows)
+        residuals[:, :6] -= c.cold + np.einsum("nij,nj->ni", self.effect.reshape(-1, 6, 4), strain)
+        return residuals
 
     def _of_twist(self, c: Known[Array]) -> Array:
         """Return the derivatives of the readings by the twists that they see, (n, m, w, 6)."""
@@ -241,12 +241,12 @@ class Campaign:
             return np.broadcast_to(to_map[:, None], (at.size, 6, 1, 6))
         A = chain.carriage_adjoint(pose, c.lever[0])
         fine = self.slopes[0][at // artefacts, at % artefacts]
-        found = np.zeros((at.size, 8, artefacts, 6))
-        found[at, :6, at % artefacts] = to_map
+        derivatives = np.zeros((at.size, 8, artefacts, 6))
+        derivatives[at, :6, at % artefacts] = to_map
         for k, (turn, shift, sign) in enumerate(_GUIDE):
-            found[:, 6 + k] = -sign * fine[..., None] * A[shift]
-            found[at, 6 + k, at % artefacts] += A[turn]
-        return found
+            derivatives[:, 6 + k] = -sign * fine[..., None] * A[shift]
+            derivatives[at, 6 + k, at % artefacts] += A[turn]
+        return derivatives
 
     def _derivatives(self, y: Array, x: Unknowns[Array], c: Known[Array]) -> dict[str, Array]:  # noqa: ARG002 - linear
         """Return the derivatives of the residuals, which are linear, by all but pose and lever."""
@@ -269,7 +269,7 @@ class Campaign:
         R, place = self.rig.pose.rotation.inv(), self.rig.pose.translation
         to_map = np.linalg.inv(chain.from_maps(self.rig.pose)[:3, :3])
         effect = np.zeros((*self.shape, 6, 4))
-        effect[..., :3] = self.found.effect[..., :6, :]
+        effect[..., :3] = self.registrations.effect[..., :6, :]
         # The strain of a larger warm artefact is negative: it makes the warm map as small as the cold one.
         effect[..., :3, 2] += self.height * to_map[:, 2]
         effect[..., :3, 3] = to_map @ R.apply(place)
@@ -316,11 +316,11 @@ class Campaign:
     def profiler(self) -> tuple[Array, Array, Array]:
         """Return the twists of the profiler, their covariance, and what of it the cold scans cause."""
         W = chain.from_maps(self.rig.pose)[:6, :6]
-        effect, noise = self.effect, self.found.covariance[..., :6, :6]
+        effect, noise = self.effect, self.registrations.covariance[..., :6, :6]
         C = noise + effect * np.square(self.strains) @ np.swapaxes(effect, -1, -2)
-        cold = self.found.cold_share[..., None, None] * noise
+        cold = self.registrations.cold_share[..., None, None] * noise
         # the same bits for any number of artefacts
-        return np.einsum("...j,ij->...i", self.found.twist[..., :6], W), W @ C @ W.T, W @ cold @ W.T
+        return np.einsum("...j,ij->...i", self.registrations.twist[..., :6], W), W @ C @ W.T, W @ cold @ W.T
 
     def carriage(self) -> tuple[Array, Array]:
         """Return the errors of the carriage, and their covariance without that of pose and lever."""
@@ -346,11 +346,11 @@ class Campaign:
 
     def predicted(self) -> Array:
         """Return the covariance that follows from surfaces and stated noise alone, (artefact, 6, 6)."""
-        bound = self.found.bound
-        ideal = Registrations.empty(2, len(bound), cold=self.found.cold)
+        bound = self.registrations.bound
+        ideal = Registrations.empty(2, len(bound), cold=self.registrations.cold)
         known = np.isfinite(bound[:, 0, 0])
         ideal.twist[1, known], ideal.covariance[1], ideal.cold_share[1] = 0.0, bound, 0.0
-        alone = replace(self, found=ideal, strains=np.zeros(4))
+        alone = replace(self, registrations=ideal, strains=np.zeros(4))
         if self.guide is None or not known.any():
             twists: Array = alone.carriage()[1][1].copy()
             return twists

@@ -121,21 +121,23 @@ class Registrations:
         def values(name: str, *dims: str) -> Array:
             return np.array(raw[name].transpose("cycle", *dims).values, dtype=float)
 
-        found = cls.empty(raw.sizes["cycle"], raw.sizes["artefact"])
+        registrations = cls.empty(raw.sizes["cycle"], raw.sizes["artefact"])
         for name, part in (("displacement", slice(0, 3)), ("rotation", slice(3, 6))):
-            found.twist[..., part] = values(name, "artefact", "direction")
-        found.twist[..., 6:] = 0.0
-        found.covariance[:] = 0.0
-        found.covariance[..., :6, :6] = values("registration_covariance", "artefact", "registered", "registered_")
-        known = np.isfinite(found.twist).all(axis=-1) & np.isfinite(found.covariance).all(axis=(-2, -1))
-        found.twist[~known], found.covariance[~known] = np.nan, np.nan
-        found.reason[~known] = "there is no registration"
-        found.cold[known.any(axis=0)] = 0
+            registrations.twist[..., part] = values(name, "artefact", "direction")
+        registrations.twist[..., 6:] = 0.0
+        registrations.covariance[:] = 0.0
+        registrations.covariance[..., :6, :6] = values(
+            "registration_covariance", "artefact", "registered", "registered_"
+        )
+        known = np.isfinite(registrations.twist).all(axis=-1) & np.isfinite(registrations.covariance).all(axis=(-2, -1))
+        registrations.twist[~known], registrations.covariance[~known] = np.nan, np.nan
+        registrations.reason[~known] = "there is no registration"
+        registrations.cold[known.any(axis=0)] = 0
         if "strain_effect" in raw:
-            found.effect[..., :6, :] = values("strain_effect", "artefact", "registered", "strain")
-        found.cold_share[:] = values("cold_share", "artefact")
-        found.time[:] = values("time")[:, None]
-        return found
+            registrations.effect[..., :6, :] = values("strain_effect", "artefact", "registered", "strain")
+        registrations.cold_share[:] = values("cold_share", "artefact")
+        registrations.time[:] = values("time")[:, None]
+        return registrations
 
     def of_cycles(self, rows: Sequence[int], excluded: NDArray[np.bool_] | None = None) -> Registrations:
         """Return the registrations of some cycles, NaN where ``excluded`` (cycle, artefact) is True."""
@@ -180,10 +182,10 @@ def register_all(
         Stated standard deviation of one height, m, for the bound.
     settings : CrossbeamScanSettings
     """
-    found = Registrations.empty(scans.cycles, scans.artefacts)
+    registrations = Registrations.empty(scans.cycles, scans.artefacts)
     for artefact in range(scans.artefacts):
-        found.maps.append(_artefact(scans, artefact, cold_cycles, height_noise, settings, found))
-    return found
+        registrations.maps.append(_artefact(scans, artefact, cold_cycles, height_noise, settings, registrations))
+    return registrations
 
 
 def _artefact(
@@ -192,7 +194,7 @@ def _artefact(
     cold_cycles: Sequence[int],
     noise: float,
     settings: CrossbeamScanSettings,
-    found: Registrations,
+    registrations: Registrations,
 ) -> Maps | None:
     """Register all scans of one artefact; return its maps."""
     order = [*cold_cycles, *(c for c in range(scans.cycles) if c not in cold_cycles)]
@@ -200,31 +202,31 @@ def _artefact(
     maps: Maps | None = None
     for cycle, scan in zip(order, _prefetched(scans, order, k), strict=True):
         if cold is None and cycle not in cold_cycles:
-            found.reason[cycle, k] = "there is no cold scan to register it onto"
+            registrations.reason[cycle, k] = "there is no cold scan to register it onto"
             continue
         try:
-            found.time[cycle, k], warm = scan
+            registrations.time[cycle, k], warm = scan
             if isinstance(warm, MethodError):
                 raise warm
             if cold is None:
                 cold, maps = warm, _maps(warm)
-                found.cold[k] = cycle
-                found.bound[k] = bound(cold, noise, with_drift=settings.strain != "rigid")
-                found.twist[cycle, k] = 0.0
-                found.covariance[cycle, k] = 0.0
-                found.cold_share[cycle, k] = 0.0
-                found.notes += _coarse(cold, k)
-                found.quality["noise_found"][cycle, k] = cold.noise
-                found.quality["points_used"][cycle, k] = cold.points.sum()
+                registrations.cold[k] = cycle
+                registrations.bound[k] = bound(cold, noise, with_drift=settings.strain != "rigid")
+                registrations.twist[cycle, k] = 0.0
+                registrations.covariance[cycle, k] = 0.0
+                registrations.cold_share[cycle, k] = 0.0
+                registrations.notes += _coarse(cold, k)
+                registrations.quality["noise_found"][cycle, k] = cold.noise
+                registrations.quality["points_used"][cycle, k] = cold.points.sum()
                 continue
             result = _register(cold, warm, settings)
-            _store(result, settings.strains(), found, cycle, k)
+            _store(result, settings.strains(), registrations, cycle, k)
             if settings.registration != "height_map":
-                found.effect[cycle, k, :6] = _of_strains(cold, warm, result)
+                registrations.effect[cycle, k, :6] = _of_strains(cold, warm, result)
             _store_maps(maps, cold, warm, result, cycle)
-            _store_quality(result, warm, found.quality, cycle, k)
+            _store_quality(result, warm, registrations.quality, cycle, k)
         except MethodError as error:
-            found.reason[cycle, k] = str(error)
+            registrations.reason[cycle, k] = str(error)
             log.warning("cycle %d, artefact %d: %s", cycle, k, error)
     return maps
 
@@ -277,7 +279,9 @@ def estimated(settings: CrossbeamScanSettings) -> dict[str, float]:
     return {name: sigma for name, sigma in settings.strains().items() if name in STRAINS and sigma > 0}
 
 
-def _store(result: Registration, strains: Mapping[str, float], found: Registrations, cycle: int, k: int) -> None:
+def _store(
+    result: Registration, strains: Mapping[str, float], registrations: Registrations, cycle: int, k: int
+) -> None:
     """Store the twist and the drift along the feed; where it is no parameter, the drift is 0 without uncertainty.
 
     The estimate z shifts with the mean m of the prior of a strain s by dz/dm = C_zs / sigma^2. A strain s about which
@@ -287,16 +291,16 @@ def _store(result: Registration, strains: Mapping[str, float], found: Registrati
     source = [*range(6), *(extra[name] for name in FEED if name in extra)]
     target = [*range(6), *(6 + i for i, name in enumerate(FEED) if name in extra)]
     C = result.joint_covariance
-    found.twist[cycle, k] = 0.0
-    found.twist[cycle, k, target] = np.concatenate([result.twist, result.extra])[source]
-    found.covariance[cycle, k] = 0.0
-    found.covariance[cycle, k][np.ix_(target, target)] = C[np.ix_(source, source)]
+    registrations.twist[cycle, k] = 0.0
+    registrations.twist[cycle, k, target] = np.concatenate([result.twist, result.extra])[source]
+    registrations.covariance[cycle, k] = 0.0
+    registrations.covariance[cycle, k][np.ix_(target, target)] = C[np.ix_(source, source)]
     for column, name in enumerate(STRAINS):
         if name in extra:
             effect = -C[source, extra[name]] / strains[name] ** 2
-            found.effect[cycle, k, target, column] = effect
-            found.covariance[cycle, k][np.ix_(target, target)] -= strains[name] ** 2 * np.outer(effect, effect)
-    found.cold_share[cycle, k] = result.cold_share
+            registrations.effect[cycle, k, target, column] = effect
+            registrations.covariance[cycle, k][np.ix_(target, target)] -= strains[name] ** 2 * np.outer(effect, effect)
+    registrations.cold_share[cycle, k] = result.cold_share
 
 
 def _of_strains(cold: BlockMap, warm: BlockMap, result: Registration) -> Array:

@@ -71,10 +71,10 @@ def identify_scans(method: ModelMethod, raw: xr.Dataset, settings: CrossbeamScan
         coords=dict(observed.coords) | labels,
         notes=[*solved.observed.notes, *pitch],
     )
-    found = dataset(method, replace(solved, observed=complete), raw, method.info, origin)
-    for note in found.em.notes:
+    errors = dataset(method, replace(solved, observed=complete), raw, method.info, origin)
+    for note in errors.em.notes:
         log.warning(note)
-    return found
+    return errors
 
 
 @dataclass(frozen=True)
@@ -106,15 +106,15 @@ class Evaluated:
 
     def extras(self, solved: Solved) -> tuple[dict[str, xr.DataArray], dict[str, Any]]:
         """Return the further results without coordinates, and their coordinates."""
-        campaign, found, rig = self.campaign, self.campaign.found, self.campaign.rig
+        campaign, registrations, rig = self.campaign, self.campaign.registrations, self.campaign.rig
         two = ("time", "position")
-        quality = found.quality
+        quality = registrations.quality
         W = chain.from_maps(rig.pose)
         u = _sigma(campaign.of_registrations(solved))
         jitter = np.stack([quality["jitter_z"], quality["jitter_y"]], axis=-1)
         out: dict[str, Any] = {
             "reason": (two, self.reason.astype(str)),
-            "scan_time": (two, found.time, {"units": "s"}),
+            "scan_time": (two, registrations.time, {"units": "s"}),
             "registration_u": ((*two, "dof"), u),
             "predicted_u": ((*two, "dof"), np.broadcast_to(_sigma(campaign.predicted()), u.shape)),
             "residual_rms": (two, quality["residual_rms"], _METRES),
@@ -122,13 +122,13 @@ class Evaluated:
             "noise_found": (two, quality["noise_found"], _METRES),
             "line_jitter": ((*two, "jitter"), jitter, _METRES),
             "condition": (two, quality["condition"]),
-            "strain": ((*two, "direction"), found.twist @ W[6:].T),
+            "strain": ((*two, "direction"), registrations.twist @ W[6:].T),
             "profiler_pose": (("row", "column"), rig.pose.as_matrix()),
             "lever": ("direction", rig.lever, _METRES),
         }
         if rig.pose_covariance is not None:
             out["pose_u"] = ("pose_parameter", np.sqrt(np.diag(rig.pose_covariance)))
-        out |= self._repeats() | _map_extras(found.maps, self.rows) | self.check.extras()
+        out |= self._repeats() | _map_extras(registrations.maps, self.rows) | self.check.extras()
         twist, covariance, by_cold = campaign.solved_profiler(solved)
         twist = np.where(self.check.wrong[self.rows][..., None], np.nan, twist)  # also where they are kept
         out |= curves(twist, covariance, by_cold, rig, campaign.positions, self.time)
@@ -140,15 +140,15 @@ class Evaluated:
 
     def _repeats(self) -> dict[str, Any]:
         """Return the errors by repeated cold scans."""
-        every = self.every.found
+        every = self.every.registrations
         own = np.arange(self.every.shape[0])[:, None] == every.cold  # a reference is 0 by definition
-        found = every.of_cycles(self.cold, own)
-        seen = np.isfinite(found.twist[1:, :, 0])
+        used = every.of_cycles(self.cold, own)
+        seen = np.isfinite(used.twist[1:, :, 0])
         if not (seen | own[self.cold[1:]]).any():
             return {}
         values, u = np.full((*seen.shape, 6), np.nan), np.full((*seen.shape, 6), np.nan)
         if seen.any():
-            repeated = replace(self.every, found=found)
+            repeated = replace(self.every, registrations=used)
             solved = solve(repeated.observed(coords={}, reference=""))
             values = solved.relative.errors.value.reshape(*repeated.shape, 6)[1:]
             u = _sigma(repeated.of_registrations(solved))[1:]
@@ -176,48 +176,48 @@ def observe(raw: xr.Dataset, settings: CrossbeamScanSettings) -> tuple[Observed,
         scans = Scans(raw)
         cycles, corrected = scans.cycles, scans.notes
         cold = cold_cycles(raw, cycles)
-        found = register_all(scans, cold, float(raw["height_noise"]), settings)
+        registrations = register_all(scans, cold, float(raw["height_noise"]), settings)
     else:
         cycles, corrected = raw.sizes["cycle"], list[str]()
         cold = cold_cycles(raw, cycles)
-        found = Registrations.stated(raw)
+        registrations = Registrations.stated(raw)
     warm = [c for c in range(cycles) if c not in cold]
     if not warm:
         raise MethodError(
             f"Expected warm scans after the cold ones; found {cycles} cycles, all of them cold",
             code="scan.no_warm_scans",
         )
-    if not np.isfinite(found.twist[warm]).any():
-        reasons = sorted({reason for reason in found.reason.ravel() if reason})
+    if not np.isfinite(registrations.twist[warm]).any():
+        reasons = sorted({reason for reason in registrations.reason.ravel() if reason})
         raise MethodError(
             f"None of {len(warm) * positions.size} warm scans could be registered onto its cold scan: "
             + "; ".join(reasons[:3]),
             code="registration.none",
         )
     rows = [cold[0], *warm]
-    time = cycle_times(found.time, rows, _planned(raw, cycles))
+    time = cycle_times(registrations.time, rows, _planned(raw, cycles))
     guide = settings.guide_uncertainty if settings.strain == "guided" else None
     strains = np.array([settings.strains()[name] for name in (*STRAINS, "mount")])
-    every = Campaign(found, positions, rig_of(raw), guide, strains, settings.height_of_artefacts())
+    every = Campaign(registrations, positions, rig_of(raw), guide, strains, settings.height_of_artefacts())
     # The check comes before the guide, which couples neighbours.
     check = check_artefacts(every, settings, time[1:], cold, warm)
     excluded = check.wrong & (settings.moved == "exclude")
-    campaign = replace(every, found=found.of_cycles(rows, excluded))
-    reason = np.where(excluded, MOVED, found.reason)[rows]
-    reason[0, found.cold >= 0] = ""
+    campaign = replace(every, registrations=registrations.of_cycles(rows, excluded))
+    reason = np.where(excluded, MOVED, registrations.reason)[rows]
+    reason[0, registrations.cold >= 0] = ""
     for_frame = {} if settings.carriage_origin is None else {"frame_origin": np.array(settings.carriage_origin)}
     observed = campaign.observed(
         coords={"time": time, "y": ("position", positions, _METRES)},
         reference="cold scans of the artefacts, before the warm-up",
         attributes={
-            "start": warm_up_start(raw, found.time, cold),
+            "start": warm_up_start(raw, registrations.time, cold),
             "reference_interval": (0.0, 0.0),
         },
         attrs={"registration": settings.registration, "strain": settings.strain, **for_frame},
         finish=lambda solved: _finished(solved, measured),
         record=None if measured else campaign.recorded,
         notes=[*_notes(reason, positions, campaign.rig), *_strain_notes(settings), *check.notes, *corrected],
-        doubts=[*check.doubts, *found.notes],
+        doubts=[*check.doubts, *registrations.notes],
     )
     return observed, Evaluated(every, campaign, rows, cold, time, check, reason)
 

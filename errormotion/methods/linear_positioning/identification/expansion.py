@@ -64,7 +64,7 @@ def sides_of(
     MethodError
         A coefficient without a temperature, or a temperature without a coefficient.
     """
-    found = []
+    sides = []
     u_T = _scalar(raw, "temperature_uncertainty", settings.uncertainty.temperature) or 0.0
     for name, sign in SIDES.items():
         side: Stated = getattr(settings, name)
@@ -84,12 +84,12 @@ def sides_of(
                 code="expansion.data.incomplete",
             )
         notes += _assumptions(raw, name, side, settings)
-        found.append(Side(name, sign, alpha, u_alpha, excess, u_T))
-    if not any(side.name == "machine" for side in found):
+        sides.append(Side(name, sign, alpha, u_alpha, excess, u_T))
+    if not any(side.name == "machine" for side in sides):
         notes.append(
             "The temperature of the positioning system is not stated: the errors apply to the temperature of the test."
         )
-    return found
+    return sides
 
 
 def _assumptions(raw: xr.Dataset, name: str, side: Stated, settings: LinearPositioningSettings) -> list[str]:

@@ -80,13 +80,15 @@ def figures(
     if not trials:
         return Extremes(value, *np.full((2, value.size), np.nan))
     true = _trials(x, z, observed, spread, shared, target_u, reversal_u, trials)
-    found = by_true_values(value, _evaluate(true, z, straight))
+    distribution = by_true_values(value, _evaluate(true, z, straight))
     mean = standard.FIGURES.index("B_mean")  # not an extreme value: unbiased
     if not np.isfinite(value[mean]):
-        return found
+        return distribution
     others = np.arange(value.size) != mean
     of_mean = np.hypot(_mean_reversal_u(x, z, spread), reversal_u.mean())
-    return replace(found, bias=np.where(others, found.bias, 0.0), u=np.where(others, found.u, of_mean))
+    return replace(
+        distribution, bias=np.where(others, distribution.bias, 0.0), u=np.where(others, distribution.u, of_mean)
+    )
 
 
 def _mean_reversal_u(x: Array, z: Array, spread: Scatter) -> float:

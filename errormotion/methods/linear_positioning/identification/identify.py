@@ -162,7 +162,7 @@ def statistics_of(
     x = evaluated.readings.corrected
     statistics = standard.statistics(x)
     figures = [_figures(evaluated, solved, k, settings.trials) for k in range(len(evaluated.spreads))]
-    found: dict[str, tuple[tuple[str, ...], Any, str]] = {
+    variables: dict[str, tuple[tuple[str, ...], Any, str]] = {
         "deviations": ((line, "approach", "run", target), x, "readings, corrected"),
         "unidirectional_mean": ((line, "approach", target), statistics.mean, "mean unidirectional deviation"),
         "unidirectional_s": (
@@ -184,7 +184,7 @@ def statistics_of(
     }
     return figures, {
         name: xr.DataArray(np.asarray(values), dims=its, attrs={"long_name": meaning, **attrs})
-        for name, (its, values, meaning) in found.items()
+        for name, (its, values, meaning) in variables.items()
     }
 
 

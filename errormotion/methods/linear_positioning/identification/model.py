@@ -100,15 +100,15 @@ def spreads_of(readings: Readings, settings: LinearPositioningSettings, what: st
 
 def trends_of(readings: Readings) -> list[Trend | None]:
     """Return the trend from run to run of each line, None where there is none that is significant."""
-    found = []
+    trends = []
     for x in readings.corrected:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a target, or a run, without readings
             offset = np.nanmean(x - np.nanmean(x, axis=1, keepdims=True), axis=(0, 2))
         of_runs = trend(offset)
         seen = of_runs is not None and of_runs.probability < SIGNIFICANT / len(readings.names)
-        found.append(of_runs if seen else None)
-    return found
+        trends.append(of_runs if seen else None)
+    return trends
 
 
 def trend_notes(readings: Readings, trends: Sequence[Trend | None]) -> list[str]:
@@ -131,7 +131,7 @@ def reversal_by_trend(readings: Readings, trends: Sequence[Trend | None], cycle:
 
     A trend of a in each run displaces a backward reading against the forward one by ``a dt`` after the part dt of a
     run. In a linear cycle dt decreases from 1 at the first target to 0 at the last one, in a pendulum cycle it is 1/2.
-    The unknown course within a run makes it uncertain: as a rectangular distribution of this half width.
+    The unknown change within a run makes it uncertain: as a rectangular distribution of this half width.
     """
     m, runs = readings.position.shape[1], readings.x.shape[2]
     later = 1.0 - np.arange(m) / max(m - 1, 1) if cycle == "linear" else np.full(m, 0.5)
@@ -317,12 +317,12 @@ def _finished(solved: Solved, names: Sequence[str], trends: Sequence[Trend | Non
     if not solved.propagated:
         return solved
     errors = solved.relative.errors
-    found = sorted(errors.sources, key=lambda source: {DRIFT: 0, NOISE: 2}.get(source.group, 1))
+    sources = sorted(errors.sources, key=lambda source: {DRIFT: 0, NOISE: 2}.get(source.group, 1))
     for k, each in enumerate(trends):
         if each is not None:
             effect = np.where(np.isnan(errors.value), np.nan, 0.0)
             of_line = effect[:, k] if effect.shape[1] == len(names) else effect.reshape(len(names), -1)[k]
             of_line += each.range / np.sqrt(12.0)
-            found.append(Source(f"{TREND}, {names[k]}", TREND, effect))
-    relative = replace(solved.relative, errors=replace(errors, sources=found))
+            sources.append(Source(f"{TREND}, {names[k]}", TREND, effect))
+    relative = replace(solved.relative, errors=replace(errors, sources=sources))
     return replace(solved, relative=relative, scatter=replace(solved.scatter, note=""))

@@ -244,7 +244,7 @@ def extras(evaluated: Evaluated, solved: Solved, settings: LinearPositioningSett
     value = solved.relative.errors.value.reshape(evaluated.t.size, 2, -1)
     u_cold = evaluated.noise / np.sqrt(np.isfinite(evaluated.x[evaluated.cold]).sum(axis=0))  # (end, freedom)
     lever = evaluated.length * evaluated.lever
-    found = [
+    notes = [
         _figures(value[..., k], evaluated.t, evaluated.is_moving, float(noise), u_cold[:, k], lever[:, k])
         for k, noise in enumerate(evaluated.noise)
     ]
@@ -252,7 +252,7 @@ def extras(evaluated: Evaluated, solved: Solved, settings: LinearPositioningSett
     return {
         name: xr.DataArray(np.array(values), dims=("freedom", "quantity", "measure"), attrs=attrs)
         for name, values in zip(
-            ("distortion", "distortion_bias", "distortion_u"), zip(*found, strict=True), strict=True
+            ("distortion", "distortion_bias", "distortion_u"), zip(*notes, strict=True), strict=True
         )
     }
 
@@ -313,9 +313,9 @@ def _figures(
             if t[-1] < end - 1e-9 or not (times <= end + 1e-9).any():
                 continue
             inside, variance = _until(x, times, end, noises[q] ** 2)
-            found = range_from_reference(inside, variance, np.tile(shared[:, None], inside.size))
-            figures[q, k], bias[q, k] = float(found.value), float(found.bias)
-            u[q, k] = float(expanded(found.bias, found.u)) / 2.0
+            extremes = range_from_reference(inside, variance, np.tile(shared[:, None], inside.size))
+            figures[q, k], bias[q, k] = float(extremes.value), float(extremes.bias)
+            u[q, k] = float(expanded(extremes.bias, extremes.u)) / 2.0
         moved = np.flatnonzero(times <= last + 1e-9)
         if moved.size:
             figures[q, 3], bias[q, 3] = x[moved[-1]], 0.0

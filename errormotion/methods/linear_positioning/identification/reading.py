@@ -233,13 +233,13 @@ def labels(raw: xr.Dataset, dim: str) -> list[str]:
 
 def approaches_of(raw: xr.Dataset) -> NDArray[np.intp]:
     """Return the number of each recorded approach, 0 forward and 1 backward; MethodError for other labels."""
-    found = labels(raw, "approach")
-    if not found or set(found) - set(APPROACHES) or len(set(found)) < len(found):
+    approaches = labels(raw, "approach")
+    if not approaches or set(approaches) - set(APPROACHES) or len(set(approaches)) < len(approaches):
         raise MethodError(
-            f"approach: expected the labels forward, backward; found {', '.join(found) or 'none'}",
+            f"approach: expected the labels forward, backward; found {', '.join(approaches) or 'none'}",
             code="position.approach.labels",
         )
-    return np.array([APPROACHES.index(name) for name in found])
+    return np.array([APPROACHES.index(name) for name in approaches])
 
 
 def freedoms_of(raw: xr.Dataset, axis: str) -> tuple[str, ...]:

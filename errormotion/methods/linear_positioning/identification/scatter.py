@@ -261,15 +261,15 @@ def _estimated(x: Array, z: Array, own: Array | None, both: bool) -> Components:
         ) from error
 
 
-def _own(found: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, float, bool, bool]:
+def _own(estimate: Components, shape: tuple[int, ...], kind: str) -> tuple[Array, float, bool, bool]:
     """Return the variance of a reading (approach, target), its degrees of freedom, whether it is pooled, and unequal.
 
     The sum of squares of the residuals at a target has the expectation of the variance times their redundancy.
     """
-    at = found.names.index(NOISE)
-    noise = found.fit.problem.noise.sd
-    pooled, freedom = float(np.square(np.nanmin(np.asarray(noise)))), float(found.freedom[at])
-    residual, left = found.fit.residual[:, 0], 1.0 - found.fit.leverage[:, 0]
+    at = estimate.names.index(NOISE)
+    noise = estimate.fit.problem.noise.sd
+    pooled, freedom = float(np.square(np.nanmin(np.asarray(noise)))), float(estimate.freedom[at])
+    residual, left = estimate.fit.residual[:, 0], 1.0 - estimate.fit.leverage[:, 0]
     known = np.isfinite(residual)
     square = np.where(known, np.square(residual), 0.0).reshape(shape).sum(axis=1)
     redundancy = np.where(known, left, 0.0).reshape(shape).sum(axis=1)
@@ -310,13 +310,13 @@ def _differ(square: Array, redundancy: Array) -> bool:
     return bool(special.chdtrc(k - 1, statistic / correction) < SIGNIFICANT)
 
 
-def _of_runs(found: Components, z: Array, both: bool) -> tuple[Array, Array, Array]:
+def _of_runs(estimate: Components, z: Array, both: bool) -> tuple[Array, Array, Array]:
     """Return the variances of the runs' effects, those of the same coefficients of a run by its noise, and freedoms.
 
     All (4,). The coefficients are offset and slope of the mean curve and of the reversal, with the variance
     ``V = (s + noise) / n`` by n runs, of which the fit states the parts.
     """
-    fit = found.fit
+    fit = estimate.fit
     free = fit.problem.unknowns.curve.freed
     a = np.zeros((*free.shape, 4))
     for k in range(2 if both else 1):
@@ -327,9 +327,9 @@ def _of_runs(found: Components, z: Array, both: bool) -> tuple[Array, Array, Arr
     b = np.zeros((q, 4))
     effect, at_border = fit.normal.solve(a, b)
     V = np.einsum("rpk,rpk->k", a, effect)
-    by_name = dict(zip(found.names, zip(found.variance, found.used, strict=True), strict=True))
+    by_name = dict(zip(estimate.names, zip(estimate.variance, estimate.used, strict=True), strict=True))
     factor = by_name[NOISE][1]  # the noise of the fit, of that in the weights
-    run, noise, freedom = np.zeros(4), np.zeros(4), found.freedom_of(a, b)
+    run, noise, freedom = np.zeros(4), np.zeros(4), estimate.freedom_of(a, b)
     for k, name in enumerate(EFFECTS):
         if name not in by_name or not V[k] > 0:
             continue

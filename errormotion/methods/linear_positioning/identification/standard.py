@@ -82,17 +82,20 @@ def statistics(x: Array) -> Statistics:
     return Statistics(np.asarray(mean), np.asarray(s))
 
 
-def figures(found: Statistics) -> Array:
+def figures(computed: Statistics) -> Array:
     """Return the figures of the axis in the order of ``FIGURES``, (..., figure).
 
     Clauses 3 and 4 of ISO 230-2:2014: ``A = max(mean + 2 s) - min(mean - 2 s)``, ``E = max(mean) - min(mean)`` over one
     or both directions, ``R`` the largest repeatability, ``M`` the range of the mean bidirectional deviations, ``B`` the
     largest reversal error, ``B_mean`` its mean over the targets, with its sign.
     """
-    upper, lower = _largest(found.mean + 2.0 * found.s), _smallest(found.mean - 2.0 * found.s)  # (..., approach)
-    highest, lowest = _largest(found.mean), _smallest(found.mean)
+    upper, lower = (
+        _largest(computed.mean + 2.0 * computed.s),
+        _smallest(computed.mean - 2.0 * computed.s),
+    )  # (..., approach)
+    highest, lowest = _largest(computed.mean), _smallest(computed.mean)
     one, systematic = upper - lower, highest - lowest
-    repeatability, reversal = _largest(found.unidirectional_repeatability), found.reversal
+    repeatability, reversal = _largest(computed.unidirectional_repeatability), computed.reversal
     both_known = np.isfinite(systematic).all(axis=-1)
 
     def both(high: Array, low: Array) -> Array:
@@ -105,10 +108,10 @@ def figures(found: Statistics) -> Array:
         both(highest, lowest),
         systematic[..., 0],
         systematic[..., 1],
-        _largest(found.repeatability),
+        _largest(computed.repeatability),
         repeatability[..., 0],
         repeatability[..., 1],
-        _largest(found.bidirectional) - _smallest(found.bidirectional),
+        _largest(computed.bidirectional) - _smallest(computed.bidirectional),
         _largest(np.abs(reversal)),
         _mean(reversal),
     ]

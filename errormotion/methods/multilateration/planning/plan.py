@@ -87,27 +87,27 @@ def with_best_layout(planned: xr.Dataset, settings: MultilaterationSettings, pla
     sees = sight.sees(own, target)
     sigma = _uncertainty(own, target, sees, noise)
     if planning.targets is None:
-        found = _best_stations(settings, planning, sight, own, sigma)
+        choice = _best_stations(settings, planning, sight, own, sigma)
     else:
-        found = choose(settings, planning, planning.targets, sight, boxes_of(planning, own, target), noise)
-    gain = _minimised(planning, found.own) / _minimised(planning, found.best) if found.better else 1.0
-    text = layout_text(p, found.station, None if planning.targets is None else found.position[found.chosen])
+        choice = choose(settings, planning, planning.targets, sight, boxes_of(planning, own, target), noise)
+    gain = _minimised(planning, choice.own) / _minimised(planning, choice.best) if choice.better else 1.0
+    text = layout_text(p, choice.station, None if planning.targets is None else choice.position[choice.chosen])
     if planning.write is not None:
         _write(planning.write, text)
     m = {"units": "m"}
     further = {
         "target_uncertainty": ("target", sigma, m),
-        "map_position": (("place", "direction"), found.position, m),
-        "map_uncertainty": (("setup", "place"), np.stack([found.own, found.best]), m),
-        **_chosen(planning, found),
-        "best_place": (("station", "direction"), found.station, m),
+        "map_position": (("place", "direction"), choice.position, m),
+        "map_uncertainty": (("setup", "place"), np.stack([choice.own, choice.best]), m),
+        **_chosen(planning, choice),
+        "best_place": (("station", "direction"), choice.station, m),
         "sees": (("station", "target"), sees.astype(np.int8)),
-        "best_sees": (("station", "place"), found.sees.astype(np.int8)),
-        "largest_uncertainty": ("setup", [np.nanmax(s) for s in (found.own, found.best)], m),
-        "mean_uncertainty": ("setup", [np.nanmean(s) for s in (found.own, found.best)], m),
+        "best_sees": (("station", "place"), choice.sees.astype(np.int8)),
+        "largest_uncertainty": ("setup", [np.nanmax(s) for s in (choice.own, choice.best)], m),
+        "mean_uncertainty": ("setup", [np.nanmean(s) for s in (choice.own, choice.best)], m),
         "gain": ((), gain, {"units": "1"}),
     }
-    notes = _notes(sigma, found, sees, gain, planning, position)
+    notes = _notes(sigma, choice, sees, gain, planning, position)
     return planned.assign(further).assign_coords(setup=list(SETUPS)).assign_attrs(notes=notes, best_layout=text)
 
 
@@ -119,14 +119,14 @@ def _uncertainty(station: Array, target: Array, sees: NDArray[np.bool_], noise: 
     MethodError
         Positions with an undetermined freedom.
     """
-    found = predicted_uncertainty(sees / noise, station, target)
-    if found is None:
+    uncertainty = predicted_uncertainty(sees / noise, station, target)
+    if uncertainty is None:
         bound(target, station, noise=noise, seen=sees)
         raise MethodError(
             "The distances do not determine stations and targets. Distribute them more widely.",
             code="network.undetermined",
         )
-    return found
+    return uncertainty
 
 
 def reading_noise(settings: MultilaterationSettings) -> float:
@@ -188,19 +188,19 @@ def _best_stations(
     )
     seen = sight.sees(station, target)
     there = _uncertainty(station, target, seen, noise)
-    found = Choice(position, np.arange(len(target)), station, here, there, here, seen)
+    choice = Choice(position, np.arange(len(target)), station, here, there, here, seen)
     unseen = np.isnan(here).sum() - np.isnan(there).sum()
     if unseen > 0 or _minimised(planning, there) < _minimised(planning, here):
-        return found
-    return replace(found, station=own, best=here, sees=sight.sees(own, target))
+        return choice
+    return replace(choice, station=own, best=here, sees=sight.sees(own, target))
 
 
-def _chosen(planning: Planning, found: Choice) -> dict[str, Any]:
+def _chosen(planning: Planning, choice: Choice) -> dict[str, Any]:
     """Return the variable of the candidates to measure, if targets are chosen."""
     if planning.targets is None:
         return {}
-    chosen = np.zeros(len(found.position), np.int8)
-    chosen[found.chosen] = 1
+    chosen = np.zeros(len(choice.position), np.int8)
+    chosen[choice.chosen] = 1
     about = {"long_name": "1: to be measured", "of": planning.targets.uncertainty}
     return {"chosen": ("place", chosen, about)}
 
@@ -217,7 +217,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _notes(
-    sigma: Array, found: Choice, sees: NDArray[np.bool_], gain: float, planning: Planning, position: Array
+    sigma: Array, choice: Choice, sees: NDArray[np.bool_], gain: float, planning: Planning, position: Array
 ) -> list[str]:
     worst = "({:.0f}, {:.0f}, {:.0f}) mm".format(*(position[np.nanargmax(sigma)] * 1e3))
     own = _largest_and_mean(sigma)
@@ -233,28 +233,28 @@ def _notes(
     if unseen := int(np.count_nonzero(np.isnan(sigma))):
         notes.append(f"Layout as set: targets visible from fewer than three stations, not determined: {unseen}.")
     if planning.targets is not None:
-        notes += _notes_of_choice(found, len(position), planning.targets.uncertainty)
-    where = "; ".join("{:.0f}, {:.0f}, {:.0f}".format(*(U * 1e3)) for U in found.station)
+        notes += _notes_of_choice(choice, len(position), planning.targets.uncertainty)
+    where = "; ".join("{:.0f}, {:.0f}, {:.0f}".format(*(U * 1e3)) for U in choice.station)
     if gain != 1:
-        best = _largest_and_mean(found.best)
+        best = _largest_and_mean(choice.best)
         notes.append(
             f"Best layout within the boxes: at most {best[0]}, {best[1]} on average. Its {planning.minimise} "
             f"uncertainty is {_times(gain)}. Stations at (mm): {where}."
         )
     else:
         notes.append("No better layout was found within the boxes.")
-    if text := map_text(found.position, found.own, found.best):
+    if text := map_text(choice.position, choice.own, choice.best):
         notes.append(text)
     if planning.write is not None:
         notes.append(f"The best layout is in {planning.write}. It can replace the layout of the campaign.")
     return notes
 
 
-def _notes_of_choice(found: Choice, own: int, of: str) -> list[str]:
+def _notes_of_choice(choice: Choice, own: int, of: str) -> list[str]:
     what = "the error calculated from the errors of the axes" if of == "axes" else "a target measured there"
-    as_set, chosen = _largest_and_mean(found.own), _largest_and_mean(found.before)
+    as_set, chosen = _largest_and_mean(choice.own), _largest_and_mean(choice.before)
     return [
-        f"{len(found.chosen)} of {len(found.position)} candidates are chosen as targets. Over the box, the standard "
+        f"{len(choice.chosen)} of {len(choice.position)} candidates are chosen as targets. Over the box, the standard "
         f"uncertainty of {what} is at most {as_set[0]} and {as_set[1]} on average with the {own} targets as set; at "
         f"most {chosen[0]} and {chosen[1]} on average with the chosen ones, from the same stations.",
     ]

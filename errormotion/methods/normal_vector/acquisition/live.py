@@ -56,8 +56,8 @@ class LiveBalls:
         common = good & np.isfinite(self._first).all(axis=-1)
         direction = approach[common]
         moved = np.einsum("ik,ik->i", position[common] - self._first[common], direction)
-        found, _, rank, _ = np.linalg.lstsq(direction, moved, rcond=None)
+        displacement, _, rank, _ = np.linalg.lstsq(direction, moved, rcond=None)
         if rank < 3:
             return "too few touches"
-        x, y, z = found * 1e6
+        x, y, z = displacement * 1e6
         return f"balls X {x:+.1f} Y {y:+.1f} Z {z:+.1f} um since {self._since}"

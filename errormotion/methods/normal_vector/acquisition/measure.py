@@ -118,9 +118,9 @@ def _driven(machine: Warming, measure: Measure, record: Record) -> Iterator[xr.D
             if number == 0:
                 record.refuse_unknown_balls(contacts)
                 machine.warm_from = machine.now
-            found = record.dataset(contacts, start, machine.now, machine.origin, history)
+            chunk = record.dataset(contacts, start, machine.now, machine.origin, history)
             if number >= record.first:
-                yield found
+                yield chunk
             number += 1
         machine.turn(0.0)
     except GeneratorExit:  # the acquisition was ended; the bench may be closed already

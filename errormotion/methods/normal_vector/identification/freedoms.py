@@ -57,9 +57,9 @@ class Motion:
         """Return twists (..., 6) from the errors that are determined, (..., p); 0 for the others."""
         if values.shape[-1] == 6:
             return values
-        found = np.zeros((*values.shape[:-1], 6))
-        found[..., list(self.seen)] = values
-        return found
+        twist = np.zeros((*values.shape[:-1], 6))
+        twist[..., list(self.seen)] = values
+        return twist
 
     def error(self, values: Array, position: Array) -> Array:
         """Return e at positions (..., 3), m, for the errors that are determined, (..., p)."""

@@ -53,8 +53,8 @@ def chosen(names: Sequence[str], stated: Sequence[str] | None) -> list[int]:
 def plane_normals(centre: Array) -> Array:
     """Return the unit normals of the planes P1 P2 P3 and P1 P2 P4 of centres (..., 4, 3): (..., 2, 3)."""
     first, second, third, fourth = (centre[..., i, :] for i in range(4))
-    found = np.stack([np.cross(second - first, other - first) for other in (third, fourth)], axis=-2)
-    return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
+    normals = np.stack([np.cross(second - first, other - first) for other in (third, fourth)], axis=-2)
+    return np.asarray(normals / np.linalg.norm(normals, axis=-1, keepdims=True))
 
 
 def planes_apart(centre: Array) -> bool:

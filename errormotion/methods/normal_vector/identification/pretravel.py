@@ -197,16 +197,16 @@ def _fit(points: Array, contact: float, highest: int) -> _Fit | None:
         distance = np.linalg.norm(offset, axis=1)
         n = offset / distance[:, None]
         A = np.hstack([harmonics(n, degrees, orders), -n])  # R + r - |p - c| = H b - n dc
-        found, _, _, singular = np.linalg.lstsq(A, contact - distance, rcond=None)
+        coefficients, _, _, singular = np.linalg.lstsq(A, contact - distance, rcond=None)
         if singular[-1] < _SINGULAR * singular[0]:
             return None
-        centre = centre + found[-3:]
-        if np.abs(found[-3:]).max() < 1e-12:
+        centre = centre + coefficients[-3:]
+        if np.abs(coefficients[-3:]).max() < 1e-12:
             break
-    residual = contact - distance - A @ found
+    residual = contact - distance - A @ coefficients
     leverage = (np.linalg.qr(A)[0] ** 2).sum(axis=1)
     left_out = residual / np.maximum(1.0 - leverage, 1e-9)
-    return _Fit(highest, centre, found[:-3], A, residual, left_out)
+    return _Fit(highest, centre, coefficients[:-3], A, residual, left_out)
 
 
 def _first_centre(points: Array) -> Array:

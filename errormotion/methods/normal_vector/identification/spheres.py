@@ -92,17 +92,17 @@ def spheres(position: Array, valid: NDArray[np.bool_]) -> tuple[Array, Array]:
     """
     count = valid.sum(axis=0)
     mean = np.where(valid[..., None], position, 0.0).sum(axis=0) / np.maximum(count, 1)[..., None]
-    found = []
+    fitted = []
     for i, points in enumerate(mean):
         try:
-            found.append(fit_sphere(points[count[i] > 0]))
+            fitted.append(fit_sphere(points[count[i] > 0]))
         except FitError as error:
             raise MethodError(
                 f"Ball {i + 1} has no sphere through its touches in {int((count[i] > 0).sum())} directions: {error}. "
                 "Touch every ball five times or more, around it and on top.",
                 code="probing.ball.no_sphere",
             ) from error
-    return np.array([sphere.centre for sphere in found]), np.array([sphere.radius for sphere in found])
+    return np.array([sphere.centre for sphere in fitted]), np.array([sphere.radius for sphere in fitted])
 
 
 def improved(centre: Array, position: Array, valid: NDArray[np.bool_]) -> Array:

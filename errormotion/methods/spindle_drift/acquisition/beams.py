@@ -129,14 +129,14 @@ def _record_scan(
 
     def chunk() -> xr.Dataset:
         record = np.concatenate(pending)
-        found = static.assign(
+        part = static.assign(
             record=("sample", record, {"units": "m"}),
             scan=("sample", np.full(record.size, scan, np.int16)),
             attempt=("sample", np.full(record.size, attempt, np.int16)),
         )
-        found["record"].encoding = dict(frame.encoding)
+        part["record"].encoding = dict(frame.encoding)
         pending.clear()
-        return found
+        return part
 
     try:
         for samples in frame.stream([name]):

@@ -170,13 +170,13 @@ def _static(bench: Bench, frame: Any, settings: SpindleDriftSettings, beams: xr.
         "level": ("height", np.asarray(g.levels, np.float64), {"units": "m"}),
     }
     if beams is not None:
-        found = beams.sel(beam=list(CHANNELS))
+        used = beams.sel(beam=list(CHANNELS))
         origin, direction = (
-            found[name].transpose("beam", "direction").values for name in ("beam_origin", "beam_direction")
+            used[name].transpose("beam", "direction").values for name in ("beam_origin", "beam_direction")
         )
         variables["beam_covariance"] = (
             ("channel", "p", "p_"),
-            found["beam_covariance"].transpose("beam", "p", "p_").values,
+            used["beam_covariance"].transpose("beam", "p", "p_").values,
         )
     variables["beam_origin"] = (("channel", "direction"), origin, {"units": "m"})
     variables["beam_direction"] = (("channel", "direction"), direction, {"units": "1"})

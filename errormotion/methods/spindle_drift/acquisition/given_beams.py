@@ -42,7 +42,7 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
         )
     if not inputs:
         return None
-    found = [_beam(inputs, name) for name in CHANNELS]
+    beams = [_beam(inputs, name) for name in CHANNELS]
     frames = {str(part.attrs.get("frame", "machine")) for part in inputs.values()}
     if len(frames) > 1:
         raise MethodError(
@@ -50,7 +50,7 @@ def given_beams(inputs: Mapping[str, xr.Dataset]) -> xr.Dataset | None:
             "frame with ds.em.in_frame.",
             code="beams.input.frames",
         )
-    return xr.concat(found, dim="beam", join="override", combine_attrs="override").assign_coords(beam=list(CHANNELS))
+    return xr.concat(beams, dim="beam", join="override", combine_attrs="override").assign_coords(beam=list(CHANNELS))
 
 
 def _beam(inputs: Mapping[str, xr.Dataset], channel: str) -> xr.Dataset:

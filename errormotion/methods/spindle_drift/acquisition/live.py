@@ -39,12 +39,14 @@ class LiveDrift:
         for time, part in slices(chunk):
             if self._start is None:
                 self._start, _ = first_and_last(time)
-            found = self._averager.update(time, part["distance"].transpose("channel", "time").values)
-            known = np.isfinite(found.mean).all(axis=0)
+            averages = self._averager.update(time, part["distance"].transpose("channel", "time").values)
+            known = np.isfinite(averages.mean).all(axis=0)
             reference_time = self._settings.reference_time
-            known &= found.time >= self._start + (self._settings.spin_up if reference_time is None else reference_time)
+            known &= averages.time >= self._start + (
+                self._settings.spin_up if reference_time is None else reference_time
+            )
             if known.any():
-                self._evaluate(found.mean[:, known], chunk)
+                self._evaluate(averages.mean[:, known], chunk)
         return self.text()
 
     def _evaluate(self, mean: Array, chunk: xr.Dataset) -> None:

@@ -73,12 +73,12 @@ def missing_places(
 
     ``counts`` are the numbers of the others, from `window_sums`. The first value of a window has the place 0.
     """
-    found = np.zeros(counts.shape, np.int64)
+    missing = np.zeros(counts.shape, np.int64)
     for channel in np.flatnonzero((counts < np.diff(edges)).any(axis=1)):
         lost = np.flatnonzero(np.isnan(values[channel, edges[0] : edges[-1]])) + edges[0]
         window = np.searchsorted(edges, lost, side="right") - 1
-        found[channel] = np.bincount(window, weights=lost - edges[window], minlength=counts.shape[1])
-    return found
+        missing[channel] = np.bincount(window, weights=lost - edges[window], minlength=counts.shape[1])
+    return missing
 
 
 def _groups(samples: NDArray[np.int64]) -> Iterator[slice]:

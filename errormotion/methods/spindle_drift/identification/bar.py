@@ -50,12 +50,12 @@ def fit_axis(distance: Array, origin: Array, direction: Array, radius: float, le
     """
     u = direction[:SIDE]
     surface = origin[..., :SIDE, :] + u * distance[:SIDE].T[:, :, None]  # (instant, beam, 3)
-    found = np.full((len(surface), 4), np.nan)
+    axes = np.full((len(surface), 4), np.nan)
     instant = np.flatnonzero(np.isfinite(surface).all(axis=(1, 2)))
-    start = _start(surface[instant[0]], u, radius, levels) if instant.size else found[:0]
+    start = _start(surface[instant[0]], u, radius, levels) if instant.size else axes[:0]
     if np.isfinite(start).all() and instant.size:
-        found[instant] = _newton(surface[instant], radius, float(levels[0]), float(levels[1]), start)
-    return found
+        axes[instant] = _newton(surface[instant], radius, float(levels[0]), float(levels[1]), start)
+    return axes
 
 
 def _start(point: Array, direction: Array, radius: float, levels: Array) -> Array:
@@ -76,7 +76,7 @@ def _start(point: Array, direction: Array, radius: float, levels: Array) -> Arra
 def _newton(surface: Array, radius: float, z1: float, z2: float, start: Array) -> Array:
     """Return the axes (instant, 4) of points (instant, 4, 3) by Newton's method, all instants at the same time."""
     height = z2 - z1
-    found = np.full((len(surface), 4), np.nan)
+    axes = np.full((len(surface), 4), np.nan)
     instant, q = np.arange(len(surface)), np.tile(start, (len(surface), 1))
     for _ in range(MAX_STEPS):
         slope = (q[:, 2:] - q[:, :2]) / height
@@ -92,12 +92,12 @@ def _newton(surface: Array, radius: float, z1: float, z2: float, start: Array) -
         q = q + step
         size = np.abs(step).max(axis=1)
         done = size <= _LAST_STEP
-        found[instant[done]] = q[done]
+        axes[instant[done]] = q[done]
         going = size > _LAST_STEP  # False for NaN: no cylinder there
         instant, q, surface = instant[going], q[going], surface[going]
         if not instant.size:
             break
-    return found
+    return axes
 
 
 def states(distance: Array, origin: Array, direction: Array, radius: float, levels: Array) -> Array:

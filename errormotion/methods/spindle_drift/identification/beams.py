@@ -373,8 +373,10 @@ def _arc(s: Array, readings: Array, radius: float) -> tuple[float, float]:
     from scipy.optimize import leastsq
 
     # The full output has no warning of tolerances that rounding does not allow.
-    found = leastsq(misfit, start / unit, Dfun=slopes, full_output=True, ftol=1e-14, xtol=1e-14, gtol=1e-14, maxfev=300)
-    s0, y0, _ = found[0] * unit
+    solution = leastsq(
+        misfit, start / unit, Dfun=slopes, full_output=True, ftol=1e-14, xtol=1e-14, gtol=1e-14, maxfev=300
+    )
+    s0, y0, _ = solution[0] * unit
     return float(s0), float(y0)
 
 

@@ -57,7 +57,7 @@ def identify_beams(raw: xr.Dataset, settings: SpindleDriftSettings, method: str,
         float(raw[each]) if each in raw else 0.0 for each in ("sphere_radius_uncertainty", "position_scale_uncertainty")
     )
     middle = np.nanmean(centre, axis=(0, 1, 2))
-    found: list[Beam] = []
+    beams: list[Beam] = []
     paper_origin, paper_direction = np.full_like(origin0, np.nan), np.full_like(origin0, np.nan)
     for i, name in enumerate(names):
         beam = likelihood_fit(
@@ -71,7 +71,7 @@ def identify_beams(raw: xr.Dataset, settings: SpindleDriftSettings, method: str,
             scale_uncertainty=scale_u,
             middle=middle,
         )
-        found.append(beam)
+        beams.append(beam)
         if not isinstance(settings, TrialSettings):
             clean = distance[i].copy()
             clean[tuple(beam.left_out.T)] = np.nan
@@ -83,17 +83,17 @@ def identify_beams(raw: xr.Dataset, settings: SpindleDriftSettings, method: str,
             outliers = ", ".join(f"profile {p} step {s}" for p, s in beam.left_out[:5])
             notes.append(f"{name}: {len(beam.left_out)} readings are outliers and were ignored: {outliers}.")
         notes += [f"{name}: {note}" for note in beam.notes]
-    directions = np.array([b.direction for b in found])
+    directions = np.array([b.direction for b in beams])
     errors, covariance = beam_errors(
         origin0,
         direction0,
-        np.array([b.origin for b in found]),
+        np.array([b.origin for b in beams]),
         directions,
-        np.array([b.covariance for b in found]),
+        np.array([b.covariance for b in beams]),
     )
-    sources = list(found[0].influence)
+    sources = list(beams[0].influence)
     chart = error_jacobian(direction0, directions)
-    effects = [np.einsum("bij,bj->bi", chart, np.array([b.influence[one] for b in found])) for one in sources]
+    effects = [np.einsum("bij,bj->bi", chart, np.array([b.influence[one] for b in beams])) for one in sources]
     for note in notes:
         log.warning(note)
     parameters = ["px", "py", "pz", "ux", "uy", "uz"]
@@ -102,24 +102,24 @@ def identify_beams(raw: xr.Dataset, settings: SpindleDriftSettings, method: str,
         return xr.DataArray(values, dims=("beam", "direction"), attrs={"units": unit})
 
     extras = {
-        "beam_origin": vectors(np.array([b.origin for b in found]), "m"),
-        "beam_direction": vectors(np.array([b.direction for b in found]), "1"),
+        "beam_origin": vectors(np.array([b.origin for b in beams]), "m"),
+        "beam_direction": vectors(np.array([b.direction for b in beams]), "1"),
         "nominal_origin": vectors(origin0, "m"),
         "nominal_direction": vectors(direction0, "1"),
         "paper_origin": vectors(paper_origin, "m"),
         "paper_direction": vectors(paper_direction, "1"),
         "beam_covariance": xr.DataArray(
-            np.array([b.covariance for b in found]),
+            np.array([b.covariance for b in beams]),
             dims=("beam", "p", "p_"),
             attrs={"units": "SI: m for p, 1 for u"},
         ),
         "residual": xr.DataArray(
-            np.array([b.residual for b in found]),
+            np.array([b.residual for b in beams]),
             dims=("beam", "profile", "step"),
             attrs={"units": "m"},
         ),
-        "noise": xr.DataArray(np.array([b.noise for b in found]), dims="beam", attrs={"units": "m"}),
-        "left_out": xr.DataArray(np.array([len(b.left_out) for b in found]), dims="beam"),
+        "noise": xr.DataArray(np.array([b.noise for b in beams]), dims="beam", attrs={"units": "m"}),
+        "left_out": xr.DataArray(np.array([len(b.left_out) for b in beams]), dims="beam"),
     }
     ds = build_errors(
         errors,

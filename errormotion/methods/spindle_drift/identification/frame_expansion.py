@@ -121,13 +121,13 @@ class LocalLine:
         """Return the weight (instant,) of each value in a linear combination of smoothed values, ``S' combination``."""
         combination = np.where(self.known, combination, 0.0)
         slope = combination * self._slope
-        found = []
+        weights = []
         for part in (combination / self._n - slope * self._middle, slope):
             steps = np.zeros(part.size + 1)
             np.add.at(steps, self._first, part)
             np.subtract.at(steps, self._end, part)
-            found.append(np.cumsum(steps)[:-1])
-        return np.where(self.known, found[0] + found[1] * self._x, 0.0)
+            weights.append(np.cumsum(steps)[:-1])
+        return np.where(self.known, weights[0] + weights[1] * self._x, 0.0)
 
     def noise(self, values: Array, smooth: Array) -> float:
         """Return the standard deviation of one value: white noise that gives the smoothed values their variance.

@@ -20,7 +20,7 @@ from errormotion.arrays import Array
 from errormotion.datasets.timing import SWITCHING
 from errormotion.errors import MethodError
 from errormotion.estimation.extremes import expanded, range_from_reference
-from errormotion.methods.spindle_drift.identification.record import turns
+from errormotion.methods.spindle_drift.identification.record import is_rotating
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -151,7 +151,7 @@ def evaluate(
     bias, uncertainty = np.zeros_like(value), np.full_like(value, np.nan)
     influence = np.zeros((len(series.influence), *value.shape))
     step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    turning = spindle_speed is not None and bool(turns(spindle_speed).any())
+    turning = spindle_speed is not None and bool(is_rotating(spindle_speed).any())
     still = spindle_speed is not None and not turning
     end = running_end if running_end is not None else _end_of_running(time, spindle_speed, turning) + mean / 2
     until_then = time + mean / 2 <= end + 1e-6
@@ -182,13 +182,13 @@ def evaluate(
         value[k, 6] = _time_constant(time[running], series.value[k, running])
         tail = running[time[running] >= end - _SLOPE_SPAN]
         if tail.size > 10 and np.ptp(time[tail]) > 0.9 * _SLOPE_SPAN:
-            found = series.weighted(k, tail, _slope_weights(time[tail]))
-            value[k, 7], uncertainty[k, 7], influence[:, k, 7] = found
+            weighted = series.weighted(k, tail, _slope_weights(time[tail]))
+            value[k, 7], uncertainty[k, 7], influence[:, k, 7] = weighted
         if change is not None:
             warm = running[np.isfinite(change[running])]
             if warm.size > 10 and np.ptp(change[warm]) > _MIN_CHANGE:
-                found = series.weighted(k, warm, _slope_weights(change[warm]))
-                value[k, 8], uncertainty[k, 8], influence[:, k, 8] = found
+                weighted = series.weighted(k, warm, _slope_weights(change[warm]))
+                value[k, 8], uncertainty[k, 8], influence[:, k, 8] = weighted
     bias[np.isnan(value)] = np.nan
     test = "ETVE (spindle still)" if still else "rotating spindle" if turning else "spindle speed not recorded"
     return Results(test, value, bias, uncertainty, influence, hottest, series)
@@ -233,15 +233,15 @@ def _range(series: Series, k: int, parts: list[Weighted], reference: Index) -> t
         value[i] = series.value[k, part.index] @ part.weights
         variance[i] = series.variance[k, part.index] @ part.weights**2
         shared[:, i] = series.influence[:, k, part.index] @ part.weights
-    found = range_from_reference(value, variance, shared)
+    extremes = range_from_reference(value, variance, shared)
     every = [Weighted(reference, np.full(reference.size, 1.0 / reference.size)), *parts]
     levels = np.concatenate([[series.value[k, reference].mean()], value])
     top, bottom = every[int(levels.argmax())], every[int(levels.argmin())]
     _, u, effects = series.weighted(
         k, np.concatenate([top.index, bottom.index]), np.concatenate([top.weights, -bottom.weights])
     )
-    size, bias = float(found.value), float(found.bias)
-    return (size, bias, max(float(expanded(bias, found.u)) / 2.0, u)), effects
+    size, bias = float(extremes.value), float(extremes.bias)
+    return (size, bias, max(float(expanded(bias, extremes.u)) / 2.0, u)), effects
 
 
 def _blocks(index: Index, time: Array, length: float) -> list[Index]:
@@ -256,7 +256,7 @@ def _blocks(index: Index, time: Array, length: float) -> list[Index]:
 def _end_of_running(time: Array, speed: Array | None, turning: bool) -> float:
     if speed is None or not turning:
         return float(time[-1])
-    return float(time[np.flatnonzero(turns(speed))[-1]])
+    return float(time[np.flatnonzero(is_rotating(speed))[-1]])
 
 
 def _thermometer(
@@ -310,5 +310,5 @@ def _time_constant(time: Array, y: Array) -> float:
         return np.nan
     from scipy.optimize import minimize_scalar
 
-    found = minimize_scalar(rest, bounds=(grid[best - 1], grid[best + 1]), method="bounded")
-    return float(np.exp(found.x)) if found.fun < 0.1 * total else np.nan
+    minimum = minimize_scalar(rest, bounds=(grid[best - 1], grid[best + 1]), method="bounded")
+    return float(np.exp(minimum.x)) if minimum.fun < 0.1 * total else np.nan

@@ -260,7 +260,7 @@ def _scatter(
     time: Array, readings: NDArray[np.floating[Any]], speed: Array, settings: SpindleDriftSettings
 ) -> Array | None:
     """Return the standard deviation (5,) of the readings of one mean at steady speed, or None if there is none here."""
-    turning = turns(speed)
+    turning = is_rotating(speed)
     start = int(np.argmax(turning))
     first, end = np.searchsorted(time, time[start] + settings.spin_up + np.array([0.0, settings.average]))
     if not turning[start] or end - first < _ENOUGH or end >= time.size or not turning[first:end].all():
@@ -365,12 +365,12 @@ def slow(record: Record, sigma: Array, settings: SpindleDriftSettings, notes: li
     if settings.noise == "stated":
         return np.zeros(len(CHANNELS))
     values = np.where(settling(record, settings.spin_up), np.nan, averages.mean)
-    found = slow_noise(averages.time, values, sigma, _abrupt(record, settings))
-    if found is None:
+    noise_part = slow_noise(averages.time, values, sigma, _abrupt(record, settings))
+    if noise_part is None:
         return np.zeros(len(CHANNELS))
-    sizes = ", ".join(f"{name} {sd * 1e6:.2g} um" for name, sd in zip(CHANNELS, found.sd, strict=True) if sd > 0)
-    (doubts if found.duration > 0 else notes).append(sentence(found, sizes))
-    return found.sd
+    sizes = ", ".join(f"{name} {sd * 1e6:.2g} um" for name, sd in zip(CHANNELS, noise_part.sd, strict=True) if sd > 0)
+    (doubts if noise_part.duration > 0 else notes).append(sentence(noise_part, sizes))
+    return noise_part.sd
 
 
 def run_out_left(
@@ -384,10 +384,10 @@ def run_out_left(
     """
     averages, speed = record.averages, record.spindle_speed
     count = int(np.median(averages.expected))
-    found = np.zeros(len(CHANNELS))
+    run_out = np.zeros(len(CHANNELS))
     if speed is None or count <= 1:
-        return found
-    rate, turning, said = count / settings.average, turns(speed), set[int]()
+        return run_out
+    rate, turning, said = count / settings.average, is_rotating(speed), set[int]()
     for part in np.split(np.arange(speed.size), _changes(speed)):
         usual = float(np.median(np.abs(held(speed)[part]))) if part.size else 0.0
         if not part.size or not turning[part].any() or round(usual) in said:
@@ -408,8 +408,8 @@ def run_out_left(
                 size = each.share * np.sqrt(np.maximum(record.scatter**2 - stated**2, 0.0))
                 if (size > stated / np.sqrt(count)).any():
                     notes.append(f"{what} {100 * each.share:.0f} % of {order}; the uncertainty contains it.")
-                    found = np.maximum(found, size)
-    return found
+                    run_out = np.maximum(run_out, size)
+    return run_out
 
 
 def _abrupt(record: Record, settings: SpindleDriftSettings) -> list[float]:
@@ -418,22 +418,22 @@ def _abrupt(record: Record, settings: SpindleDriftSettings) -> list[float]:
     The last single reading before a change is the start of the curve that follows. A mean at rest contains the run-out.
     """
     time = record.averages.time
-    found = [event.at for event in settings.schedule if event.compensation]
+    times = [event.at for event in settings.schedule if event.compensation]
     if record.spindle_speed is not None:
         single = record.averages.expected[0] <= 1
-        found += [float(time[max(k - 1, 0) if single else k]) for k in _changes(record.spindle_speed)]
-    return found
+        times += [float(time[max(k - 1, 0) if single else k]) for k in _changes(record.spindle_speed)]
+    return times
 
 
 def _rounded(sigma: Array, record: Record, notes: list[str]) -> Array:
     """Return the uncertainties of means with that of rounding, which all readings of a mean may have in common."""
-    found = sigma.copy()
+    rounded = sigma.copy()
     for i, (channel, step) in enumerate(zip(CHANNELS, record.step, strict=True)):
         added = resolution.rounding_of_means(sigma[i], record.averages.count[i], float(step))
         if added is not None:
             notes.append(resolution.sentence(f"the readings of {channel}", added))
-            found[i] = np.hypot(sigma[i], added.sd)
-    return found
+            rounded[i] = np.hypot(sigma[i], added.sd)
+    return rounded
 
 
 def sensors(raw: xr.Dataset) -> list[str]:
@@ -445,7 +445,7 @@ def sensors(raw: xr.Dataset) -> list[str]:
     )
 
 
-def turns(speed: Array) -> NDArray[np.bool_]:
+def is_rotating(speed: Array) -> NDArray[np.bool_]:
     """Return where a spindle turns, in either direction; an unknown speed (NaN) is taken from the value before it."""
     known = np.isfinite(speed)
     if not known.any():
@@ -470,13 +470,13 @@ def settling(record: Record, spin_up: float) -> NDArray[np.bool_]:
     sample each) has no such means.
     """
     time, speed = record.averages.time, record.spindle_speed
-    found = np.zeros(time.size, bool)
+    is_settling = np.zeros(time.size, bool)
     if speed is None or time.size < 2 or record.averages.expected[0] <= 1 or spin_up == 0 or np.ptp(time) <= spin_up:
-        return found
+        return is_settling
     length = float(np.median(np.diff(time)))
     for k in _changes(speed):
-        found |= (time > time[k] - 0.6 * length) & (time < time[k] + spin_up - 1e-6)
-    return found
+        is_settling |= (time > time[k] - 0.6 * length) & (time < time[k] + spin_up - 1e-6)
+    return is_settling
 
 
 def _changes(speed: Array) -> NDArray[np.intp]:
@@ -497,7 +497,7 @@ def run_out_at_rest(
     n = record.averages.time.size
     if record.scatter is None or record.spindle_speed is None:
         return np.zeros(len(CHANNELS)), np.zeros(n + 1, np.intp), []
-    still = ~turns(record.spindle_speed)
+    still = ~is_rotating(record.spindle_speed)
     edges = np.flatnonzero(np.diff(still, prepend=False, append=False)).reshape(-1, 2)
     if still.all():
         edges = edges[:0]

@@ -64,8 +64,8 @@ def usual_interval(time: Times) -> float:
 def first_samples(time: Times, bounds: Array) -> NDArray[np.int64]:
     """Return the first sample at or after each bound."""
     if isinstance(time, EvenTimes):
-        found = np.ceil((bounds - time.start) / time.interval)
-        return np.clip(found, 0, time.size).astype(np.int64)
+        samples = np.ceil((bounds - time.start) / time.interval)
+        return np.clip(samples, 0, time.size).astype(np.int64)
     return np.searchsorted(time, bounds)
 
 

@@ -57,12 +57,12 @@ LOG_READERS = {MAP_SCHEMA: read_log}
 
 def _columns_of(settings: ImportMap) -> dict[str, Place]:
     """Return the column of each key of the map."""
-    found: dict[str, Place] = {"time": settings.time.column}
-    found |= {f"channels.{name}": settings.channels[name].column for name in CHANNELS}
-    found |= {f"temperatures.{name}": entry.column for name, entry in settings.temperatures.items()}
+    columns: dict[str, Place] = {"time": settings.time.column}
+    columns |= {f"channels.{name}": settings.channels[name].column for name in CHANNELS}
+    columns |= {f"temperatures.{name}": entry.column for name, entry in settings.temperatures.items()}
     if settings.spindle_speed is not None:
-        found["spindle_speed"] = settings.spindle_speed.column
-    return found
+        columns["spindle_speed"] = settings.spindle_speed.column
+    return columns
 
 
 def _check_times(columns: Columns, mistakes: Mistakes) -> None:

@@ -46,8 +46,8 @@ def text(calibration: xr.Dataset) -> list[str]:
     symmetry = ", symmetric about the triangulation plane" if values["mirror"] else ""
     low, high = values["remaining_error_um_interval"]
     estimated = ""
-    if not math.isnan(found := values["mid_range_found_mm"]):
-        estimated = f", from the readings {found:.4f} mm (u = {values['mid_range_uncertainty_mm']:.4f} mm)"
+    if not math.isnan(mid_range := values["mid_range_found_mm"]):
+        estimated = f", from the readings {mid_range:.4f} mm (u = {values['mid_range_uncertainty_mm']:.4f} mm)"
     return [
         f"calibration from {values['readings']} readings at {values['settings']} settings",
         f"order {values['order']}{symmetry}; left out: {counted(values['readings_left_out'], 'reading')}, "

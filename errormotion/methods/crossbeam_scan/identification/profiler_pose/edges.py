@@ -143,8 +143,8 @@ def pocket(x: Array, height: Array) -> tuple[Tilt, Edges]:
     step = height[lines] - (plate.height[lines, None] + plate.slope * x)
     ends = [_edges(x, step, index[lines], trim, side) for index, side in ((first, 1), (last, -1))]
     positions = np.stack(ends, axis=-1)
-    found = np.isfinite(positions).all(axis=1)
-    line, at = lines[found], positions[found]
+    valid = np.isfinite(positions).all(axis=1)
+    line, at = lines[valid], positions[valid]
     if line.size < 10:
         raise MethodError(
             f"Expected ten lines with both edges of the pocket; found {line.size}. Too many readings are missing at "

@@ -47,8 +47,8 @@ def identify_pose(raw: xr.Dataset, settings: CrossbeamScanSettings, method: str,
     MethodError
         As for `calibration.calibrate`.
     """
-    found = calibration.calibrate_dataset(raw, angle_prior=settings.angle_prior)
-    H = found.transform
+    pose = calibration.calibrate_dataset(raw, angle_prior=settings.angle_prior)
+    H = pose.transform
     nominal = (
         stated_pose(settings.profiler_pose)
         if settings.profiler_pose is not None
@@ -59,7 +59,7 @@ def identify_pose(raw: xr.Dataset, settings: CrossbeamScanSettings, method: str,
     square = (("row", "column"), ("p", "p_"))
     return build_errors(
         _deviation(H, nominal)[None],
-        (J.T @ found.covariance @ J)[None],
+        (J.T @ pose.covariance @ J)[None],
         dims=("beam",),
         coords={"beam": ["profiler"]},
         component="beam",
@@ -73,18 +73,18 @@ def identify_pose(raw: xr.Dataset, settings: CrossbeamScanSettings, method: str,
         start=start_of(raw),
         provenance=provenance.make(settings, raw, None, steps=["edges of the pocket", "fit pose"]),
         extras={
-            "profiler_pose": xr.DataArray(found.matrix, dims=square[0]),
+            "profiler_pose": xr.DataArray(pose.matrix, dims=square[0]),
             "nominal_pose": xr.DataArray(nominal.as_matrix(), dims=square[0]),
-            "pose_covariance": xr.DataArray(found.covariance, dims=square[1]),
-            "pocket_radius_found": xr.DataArray(found.radius, attrs={"units": "m"}),
+            "pose_covariance": xr.DataArray(pose.covariance, dims=square[1]),
+            "pocket_radius_found": xr.DataArray(pose.radius, attrs={"units": "m"}),
             "edge_scatter": xr.DataArray(
-                [found.residual_x, found.residual_y],
+                [pose.residual_x, pose.residual_y],
                 dims="edge_direction",
                 coords={"edge_direction": ["x", "y"]},
                 attrs={"units": "m"},
             ),
         },
-    ).assign_attrs(notes=[""], lines_used=found.lines)
+    ).assign_attrs(notes=[""], lines_used=pose.lines)
 
 
 def _deviation(pose: RigidTransform, nominal: RigidTransform) -> np.ndarray:

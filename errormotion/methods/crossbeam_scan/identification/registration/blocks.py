@@ -262,8 +262,8 @@ def _slope_noise(slope: Array, height: Array, pitch: float, axis: int) -> float:
 
 def sampled_median(values: Array) -> float:
     """Return the median of the finite out of some thousand evenly chosen values: a robust scale needs no more."""
-    found = upper_median(some_of(values))
-    return found if found == found else float(np.median(values[np.isfinite(values)]))
+    median = upper_median(some_of(values))
+    return median if median == median else float(np.median(values[np.isfinite(values)]))
 
 
 def some_of(values: Array, few: int = _FEW) -> Array:

@@ -158,14 +158,14 @@ def _icp(o3d: Any, source: Any, target: Any, start: Array, method: Any) -> Found
     """Run ICP with tolerances below the noise of the pose."""
     fine = o3d.pipelines.registration
     criteria = fine.ICPConvergenceCriteria(1e-10, 1e-12, _ICP_STEPS)
-    found = fine.registration_icp(source, target, NEAREST, start, method, criteria)
-    if found.fitness == 0:
+    registered = fine.registration_icp(source, target, NEAREST, start, method, criteria)
+    if registered.fitness == 0:
         raise MethodError(
             f"expected clouds that lie within {NEAREST * 1e3:g} mm of one another, found none of the points to do so; "
             "check units and the order of the scans",
             code="registration.clouds.apart",
         )
-    return RigidTransform.from_matrix(np.array(found.transformation)), float(found.inlier_rmse), _ICP_STEPS
+    return RigidTransform.from_matrix(np.array(registered.transformation)), float(registered.inlier_rmse), _ICP_STEPS
 
 
 BACKENDS: dict[str, Callable[[Scan, Scan], Found]] = {

@@ -122,14 +122,14 @@ def scales(radius: float, extra: int) -> Array:
     return np.array([1.0, 1.0, 1.0, *[1 / radius] * (3 + extra)])
 
 
-def refuse(found: Freedoms, what: str) -> None:
+def refuse(result: Freedoms, what: str) -> None:
     """Raise MethodError where an artefact leaves freedoms undetermined; ``what`` names the scan."""
-    if found.loose:
-        names = ", ".join(found.loose)
-        k = len(found.loose)
+    if result.loose:
+        names = ", ".join(result.loose)
+        k = len(result.loose)
         raise MethodError(
             f"expected an artefact whose surface determines all six freedoms, found {what} that leaves {k} of them "
-            f"undetermined: {names} (condition {found.condition:.2g}; it looks like {_SHAPES.get(k, 'no surface')}); "
+            f"undetermined: {names} (condition {result.condition:.2g}; it looks like {_SHAPES.get(k, 'no surface')}); "
             "use a free-form artefact, or ask for the determined freedoms only",
             code="registration.freedoms.undetermined",
         )

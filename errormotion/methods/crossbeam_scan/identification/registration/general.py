@@ -140,9 +140,9 @@ def _pairs(old: Array, new: Array, surfaces: list[Normals], pose: RigidTransform
     """Return the pairs at a pose; raise MethodError for too few of them."""
     cold, warm = surfaces
     moved = np.asarray(pose.apply(new))
-    apart, found = (np.asarray(each) for each in cKDTree(old).query(moved, distance_upper_bound=clouds.NEAREST))
+    apart, nearest = (np.asarray(each) for each in cKDTree(old).query(moved, distance_upper_bound=clouds.NEAREST))
     near = np.isfinite(apart)
-    q = found[near]
+    q = nearest[near]
     p, ahead, n = moved[near], pose.rotation.apply(warm.vectors[near]), cold.vectors[q]
     cosine = np.sum(ahead * n, axis=1)
     normal = 0.5 * (n + np.sign(cosine)[:, None] * ahead)

@@ -173,8 +173,8 @@ def _fitted(z: Array, dx: Array, dy: Array, scale: Array, plane: Array) -> Array
     *robust, mad = robust_planes(z.transpose(2, 0, 1), dx, dy.T)
     close = np.flatnonzero(mad < LARGE_SCATTER * scale)
     gate = GATE * np.maximum(mad, scale)[close]
-    good, found = _trimmed(z[..., close], dx, dy[:, close], np.stack(robust)[:, close], (gate, gate))
-    out[:, left[close[good]]] = found[:, good]
+    good, fitted_plane = _trimmed(z[..., close], dx, dy[:, close], np.stack(robust)[:, close], (gate, gate))
+    out[:, left[close[good]]] = fitted_plane[:, good]
     return out
 
 
@@ -189,12 +189,12 @@ def _trimmed(z: Array, dx: Array, dy: Array, plane: Array, gates: tuple[Array, .
         Their columns of `reduce_blocks`.
     """
     good = np.ones(z.shape[2], dtype=bool)
-    found = plane
+    trimmed = plane
     with np.errstate(invalid="ignore", divide="ignore"):
         for gate in gates:
-            enough, found = _trimmed_planes(z, dx, dy, found[:3], gate)
+            enough, trimmed = _trimmed_planes(z, dx, dy, trimmed[:3], gate)
             good &= enough
-    return good, found
+    return good, trimmed
 
 
 def _trimmed_planes(z: Array, dx: Array, dy: Array, plane: Array, gate: Array) -> tuple[NDArray[np.bool_], Array]:

@@ -209,7 +209,7 @@ def register(
     problem = Problem.of(cold, warm, extra=terms)
     at = problem.centre if point is None else np.asarray(point, dtype=float)
     if registration == "height_map":
-        found = _refined(problem, started, free, line_effects)
+        minimum = _refined(problem, started, free, line_effects)
         rms, missed = None, np.zeros(6 + len(terms.names))
     else:
         from errormotion.methods.crossbeam_scan.identification.registration import clouds
@@ -218,24 +218,24 @@ def register(
         state = State.of(pose)
         gate = GATE * problem.evaluate(state).scale()
         sums = problem.evaluate(state, gate)
-        found = _Found(state, sums, Noise(), gate, steps)
+        minimum = _Found(state, sums, Noise(), gate, steps)
         # The remaining step of the height map is the error of this pose; it is added to its covariance.
-        missed = solve(*normal_equations(sums, found.noise), free.motions, free.radius)
-    sums, state = found.sums, found.state
-    C = _covariance(problem, found, found.noise, free)
-    share = _cold_share(problem, warm, found, free, C)
+        missed = solve(*normal_equations(sums, minimum.noise), free.motions, free.radius)
+    sums, state = minimum.sums, minimum.state
+    C = _covariance(problem, minimum, minimum.noise, free)
+    share = _cold_share(problem, warm, minimum, free, C)
     C = terms.moved(_unknown(C + np.outer(missed, missed), free), at - problem.centre)
-    used = np.abs(sums.residual) < found.gate
+    used = np.abs(sums.residual) < minimum.gate
     if rms is None:
         rms = float(np.sqrt(np.mean(sums.residual[used] ** 2)))
     return Registration(
         backend=registration, pose=terms.pose_about(state.pose, state.values, at - problem.centre), point=at,
         covariance=C[:6, :6], residual=sums.residual, x=warm.x, y=warm.y,
         rms=rms, points=int(warm.points[used].sum()), noise=(cold.noise, warm.noise),
-        line_jitter=(found.noise.tau[0] * ROWS**0.5, found.noise.tau[1] * ROWS**0.5),
-        condition=free.condition, loose=free.loose, iterations=found.steps,
+        line_jitter=(minimum.noise.tau[0] * ROWS**0.5, minimum.noise.tau[1] * ROWS**0.5),
+        condition=free.condition, loose=free.loose, iterations=minimum.steps,
         extra_names=terms.names, extra=state.values, joint_covariance=C, cold_share=share,
-        variance_factor=found.noise.k,
+        variance_factor=minimum.noise.k,
     )  # fmt: skip
 
 
@@ -250,7 +250,7 @@ class _Found:
 
 def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Freedoms:
     """Return what both scans determine, from the surfaces alone: each registered onto itself."""
-    found = []
+    names = []
     for block_map, what in ((cold, "a cold scan"), (warm, "a warm scan")):
         of_slopes, of_noise = block_map.moments.information(extra.motions)
         of_noise *= NOISY * block_map.slope_noise**2
@@ -259,24 +259,24 @@ def _determined(cold: BlockMap, warm: BlockMap, loose: str, extra: Extra) -> Fre
         if loose == "refuse":
             refuse(free, what)
         extra.refuse_undetermined(of_slopes - of_noise, blocks, free)
-        found.append(free)
-    return max(found, key=lambda free: (len(free.loose), free.condition))
+        names.append(free)
+    return max(names, key=lambda free: (len(free.loose), free.condition))
 
 
-def _covariance(problem: Problem, found: _Found, noise: Noise, free: Freedoms) -> Array:
+def _covariance(problem: Problem, minimum: _Found, noise: Noise, free: Freedoms) -> Array:
     """Return the covariance (n, n) of twist and extra parameters at the problem's centre."""
-    H, _ = problem.equations(found.sums, noise, found.state)
+    H, _ = problem.equations(minimum.sums, noise, minimum.state)
     scale = scales(free.radius, len(H) - 6)
     C: Array = noise.k * np.outer(scale, scale) * inverse(H * np.outer(scale, scale), free.motions)
     return C
 
 
-def _cold_share(problem: Problem, warm: BlockMap, found: _Found, free: Freedoms, covariance: Array) -> float:
+def _cold_share(problem: Problem, warm: BlockMap, minimum: _Found, free: Freedoms, covariance: Array) -> float:
     """Return the share of the covariance that comes from the cold scan: that of its noise, and half of the jitter."""
     white = problem.cold.usual_variance / (problem.cold.usual_variance + warm.usual_variance)
-    if not any(found.noise.tau):
+    if not any(minimum.noise.tau):
         return white
-    alone = _covariance(problem, found, Noise(found.noise.k), free)
+    alone = _covariance(problem, minimum, Noise(minimum.noise.k), free)
     known = np.diag(covariance) > 0
     part = float(np.mean(np.diag(alone)[known] / np.diag(covariance)[known]))
     return part * white + (1.0 - part) * 0.5
@@ -288,8 +288,8 @@ def _start(cold: BlockMap, warm: BlockMap, free: Freedoms) -> Start:
     noise = 30 * cold.usual_variance**0.5
     start = descend(thin, thin.rest, free.motions, free.radius)
     if not start.scale < noise:
-        found = search(thin, free.motions, free.radius)
-        start = found if found.scale < start.scale else start
+        candidate = search(thin, free.motions, free.radius)
+        start = candidate if candidate.scale < start.scale else start
     if np.isinf(start.scale):
         raise MethodError(
             f"expected two scans of one position, found the cold one at {_extent(cold)} and the warm one at "

@@ -164,8 +164,8 @@ class Sums:
 
     def scale(self) -> float:
         """Return the robust standard deviation of the residuals about zero, m; infinite where there are none."""
-        found = NORMAL_MAD * upper_median(np.abs(some_of(self.residual, _FEW)))
-        return found if found == found else np.inf
+        scale = NORMAL_MAD * upper_median(np.abs(some_of(self.residual, _FEW)))
+        return scale if scale == scale else np.inf
 
 
 @dataclass(frozen=True)
