@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,8 @@ from errormotion.datasets.tables.numbers import no_value
 from errormotion.datasets.tables.table import Table
 
 DATES, NUMBERS, TEXTS, EMPTY = "dates", "numbers", "texts", "empty"
+_FIRST = 2000
+"""Number of rows from which a map is proposed."""
 _READABLE = 0.95
 """Smallest share of numbers among the cells of a column of numbers; the others are refused when it is read."""
 
@@ -85,14 +87,12 @@ class Content:
 
 
 def contents(table: Table) -> list[Content]:
-    """Return the columns of a table; a column with dates and one beside it with times of day are one."""
-    fast = table.cells.numbers(range(len(table.titles)))
-    found = []
-    for k in range(len(table.titles)):
-        if k in fast:
-            found.append(Content(table, (k,), NUMBERS if not np.isnan(fast[k]).all() else EMPTY))
-            continue
-        found.append(_content(table, k, table.texts([k])))
+    """Return the columns of a table; a column with dates and one beside it with times of day are one.
+
+    Their content is that of the first rows; only dates whose order these leave open are read completely.
+    """
+    whole, table = table, replace(table, cells=table.cells.top(_FIRST))
+    found = [_content(table, k, table.texts([k])) for k in range(len(table.titles))]
     joined: list[Content] = []
     for each in found:
         before = joined[-1] if joined else None
@@ -101,7 +101,9 @@ def contents(table: Table) -> list[Content]:
             joined[-1] = Content(table, places, DATES, tuple(orders(table.texts(places))))
             continue
         joined.append(each)
-    return joined
+    return [
+        replace(each, dates=tuple(orders(whole.texts(each.places)))) if len(each.dates) > 1 else each for each in joined
+    ]
 
 
 def _content(table: Table, place: int, texts: Sequence[str]) -> Content:

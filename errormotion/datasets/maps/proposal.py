@@ -117,6 +117,7 @@ class _State:
     schemas: tuple[RawSchema, ...]
     answers: Mapping[str, str]
     columns: tuple[tuple[Content, ...], ...] = ()
+    counts: tuple[int, ...] = ()
     form: Mapping[str, str] = field(default_factory=dict)
     chosen: RawSchema | None = None
 
@@ -156,14 +157,16 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
             if error.code != "file.numbers.ambiguous" or "decimal" in form:
                 raise
             return _unreadable(state, error)
-        state = replace(state, columns=tuple(tuple(contents(table)) for table in tables), form=form)
+        columns = tuple(tuple(contents(table)) for table in tables)
+        counts = tuple(len(table.lines) for table in tables)
+        state = replace(state, columns=columns, counts=counts, form=form)
     fits = _fits(state)
     candidates = tuple(Choice(each.raw.title, _described(each.raw)) for each, _ in fits)
     wanted = state.answers.get("raw", "")
     if wanted and wanted not in {each.value for each in candidates}:
         known = {each.value for each in candidates}
         raise DatasetError(f"raw: expected a schema that fits the file; {nearest(wanted, known)}", code="map.answer")
-    previews = [_preview(columns, []) for columns in state.columns]
+    previews = [_preview(*each, []) for each in zip(state.columns, state.counts, strict=True)]
     if not fits:
         note = (
             "the columns fit no raw schema: "
@@ -184,9 +187,9 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
     by_table = {id(each.columns[0].column.table): each for each in parts}
     previews = []
     notes = []
-    for columns in state.columns:
+    for columns, count in zip(state.columns, state.counts, strict=True):
         part = by_table.get(id(columns[0].table))
-        previews.append(_preview(columns, part.meanings(len(columns[0].table.titles)) if part else []))
+        previews.append(_preview(columns, count, part.meanings(len(columns[0].table.titles)) if part else []))
         if part is None:
             table = columns[0].table
             where = f"sheet '{table.form.sheet}' of " if table.form.sheet else ""
@@ -290,25 +293,25 @@ def _refuse_unknown(new: Iterable[str], questions: Sequence[Question], parts: Se
             raise DatasetError(f"{key}: no such question; {nearest(key, keys)}", code="map.answer")
 
 
-def _preview(columns: Sequence[Content], meanings: Sequence[str]) -> Preview:
+def _preview(columns: Sequence[Content], count: int, meanings: Sequence[str]) -> Preview:
     table = columns[0].table
-    count = len(table.titles)
-    cells = [list(table.cells.texts(k)[:_ROWS]) for k in range(count)]
+    width = len(table.titles)
+    cells = [list(table.cells.texts(k)[:_ROWS]) for k in range(width)]
     rows = tuple(tuple(column[k] for column in cells) for k in range(min(_ROWS, len(table.lines))))
     form = {
         name: value
         for name in ("encoding", "delimiter", "decimal", "thousands")
         if (value := getattr(table.form, name)) and value != "auto"
     }
-    units = tuple([*table.units, *[""] * count][:count])
+    units = tuple([*table.units, *[""] * width][:width])
     return Preview(
         table.path,
         table.form.sheet,
         tuple(table.titles),
         units,
-        tuple(meanings) or ("",) * count,
+        tuple(meanings) or ("",) * width,
         rows,
-        len(table.lines),
+        count,
         form,
         tuple(table.notes),
     )

@@ -14,7 +14,7 @@ import xarray as xr
 
 from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.maps.form import MapFile, MapTable
-from errormotion.datasets.maps.units import fitting_unit, orders
+from errormotion.datasets.maps.units import fitting_unit, is_unclear, orders
 from errormotion.datasets.schemas import Row, variants
 from errormotion.datasets.tables.dates import is_date
 from errormotion.datasets.tables.mistakes import Mistakes
@@ -174,14 +174,14 @@ def _unit(
             )
             return row.unit
     unit = table.units[where[0]] if where[0] < len(table.units) else ""
-    if not unit:
+    if not unit or is_unclear(unit):
         if row.unit in ("", "1") and not row.units:
             return ""
         goals = " or ".join(row.units or (row.unit,))
         mistakes.add(
             0,
             f"units.{base}: {table.path.name} states no unit for column '{table.titles[where[0]]}'; expected a unit of "
-            f"the kind of {goals}; found none",
+            f"the kind of {goals}; found {repr(unit) if unit else 'none'}",
         )
         return row.unit
     fitting = fitting_unit(unit, row, freedom)

@@ -12,56 +12,17 @@ from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
 _WRITTEN = {
-    "c": "degC",
-    "°c": "degC",
-    "deg c": "degC",
-    "grad c": "degC",
-    "celsius": "degC",
-    "grad": "degC",
-    "f": "degF",
-    "mu": "um",
-    "micron": "um",
-    "microns": "um",
-    "mikrometer": "um",
-    "my": "um",
-    "millimeter": "mm",
-    "mü": "um",
-    "sek": "s",
-    "sec": "s",
-    "secs": "s",
-    "seconds": "s",
-    "sekunden": "s",
-    "minuten": "min",
-    "minutes": "min",
-    "std": "h",
-    "stunden": "h",
-    "hours": "h",
-    "hrs": "h",
-    "msec": "ms",
-    "tage": "day",
-    "days": "day",
-    "d": "day",
-    "u/min": "/min",
-    "upm": "/min",
-    "rev/min": "/min",
-    "°": "deg",
-    "grd": "deg",
-    '"': "arcsec",
-    "''": "arcsec",
-    "arcsec": "arcsec",
-    "arc sec": "arcsec",
-    "sec of arc": "arcsec",
-    "winkelsekunden": "arcsec",
-    "as": "arcsec",
-    "urad": "urad",
-    "µrad": "urad",
-    "mikrorad": "urad",
-    "%rh": "%",
-    "% rh": "%",
-    "% r.f.": "%",
-    "rel. %": "%",
+    **{"µm": "um", "mu": "um", "mü": "um", "my": "um", "micron": "um", "microns": "um", "mikrometer": "um"},
+    **{"c": "degC", "°c": "degC", "deg c": "degC", "grad c": "degC", "celsius": "degC", "f": "degF", "°f": "degF"},
+    **{"sek": "s", "sec": "s", "secs": "s", "seconds": "s", "sekunden": "s", "minuten": "min", "minutes": "min"},
+    **{"std": "h", "stunden": "h", "hours": "h", "hrs": "h", "msec": "ms", "tage": "day", "days": "day", "d": "day"},
+    **{"u/min": "/min", "upm": "/min", "rev/min": "/min", "°": "deg", '"': "arcsec", "''": "arcsec", "´´": "arcsec"},
+    **{"arc sec": "arcsec", "sec of arc": "arcsec", "winkelsekunden": "arcsec", "µrad": "urad", "mikrorad": "urad"},
+    **{"%rh": "%", "% rh": "%", "%rf": "%", "% r.f.": "%", "millimeter": "mm", "µm/m": "um/m"},
 }
 """Units of programs that have another form or no meaning elsewhere, in lower case."""
+_UNCLEAR = ("grad",)
+"""Units with two meanings: an angle of 1 grad is a degree in German, and a gon elsewhere."""
 _ORDER_IS_OPEN = 400
 """Number of dates from which their order is recognised."""
 
@@ -71,9 +32,9 @@ def fitting_unit(text: str, row: Row, freedom: str = "") -> str:
     plain = same(text).strip()
     decided = unit_of_freedom(row, freedom) if freedom else ""
     goals = (decided,) if decided else row.units or (row.unit or "1",)
-    for unit in (plain, _WRITTEN.get(plain.lower(), ""), plain.lower() if plain.isupper() else ""):
+    for unit in (_WRITTEN.get(plain.lower(), ""), plain, plain.lower() if plain.isupper() else ""):
         for goal in goals:
-            if not unit:
+            if not unit or is_unclear(unit):
                 continue
             try:
                 convert(1.0, unit, goal)
@@ -81,6 +42,11 @@ def fitting_unit(text: str, row: Row, freedom: str = "") -> str:
                 continue
             return unit
     return ""
+
+
+def is_unclear(unit: str) -> bool:
+    """Return whether a unit has two meanings, so that it must be stated in another form."""
+    return unit.lower() in _UNCLEAR
 
 
 def orders(texts: Sequence[str]) -> list[str]:

@@ -36,6 +36,10 @@ class ArrayCells(Cells):
             for each in values.tolist()
         ]
 
+    def top(self, count: int) -> ArrayCells:
+        """Return the first rows, at most ``count``."""
+        return ArrayCells([column[:count] for column in self._columns])
+
     def numbers(self, columns: Sequence[int]) -> dict[int, Array]:
         """Return the columns that contain numbers only, (n,) each."""
         numeric = {k: self._columns[k] for k in columns if np.issubdtype(self._columns[k].dtype, np.number)}

@@ -275,17 +275,24 @@ def _fixed(texts: Sequence[str], unit: str) -> NDArray[np.datetime64] | None:
     if match is None or "yyyy" not in unit or "mmm" in unit:
         return None
     length = len(texts[0])
-    if set(map(len, texts)) != {length}:
+    joined = "".join(texts)
+    if set(map(len, texts)) != {length} or not joined.isascii():
         return None
-    signs = np.array(texts, dtype=f"U{length}").view(np.uint32).reshape(len(texts), length).astype(np.int64)
+    signs = np.frombuffer(joined.encode("ascii"), dtype=np.uint8).reshape(len(texts), length)
     template = signs[0]
-    is_digit = (template >= 48) & (template <= 57)
-    digits = signs[:, is_digit] - 48
-    if (signs[:, ~is_digit] != template[~is_digit]).any() or (digits < 0).any() or (digits > 9).any():
-        return None
+    for k in range(length):
+        column = signs[:, k]
+        if 48 <= template[k] <= 57:
+            if column.min() < 48 or column.max() > 57:
+                return None
+        elif (column != template[k]).any():
+            return None
 
     def number(begin: int, count: int) -> NDArray[np.int64]:
-        return (signs[:, begin : begin + count] - 48) @ 10 ** np.arange(count - 1, -1, -1)
+        found = np.zeros(len(signs), dtype=np.int64)
+        for k in range(begin, begin + count):
+            found = 10 * found + (signs[:, k] - 48)
+        return found
 
     year, month, day = (number(unit.index(part), len(part)) for part in ("yyyy", "mm", "dd"))
     hour, minute, second = number(11, 2), number(14, 2), number(17, 2)

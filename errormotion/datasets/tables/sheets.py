@@ -168,6 +168,10 @@ class SheetCells(Cells):
         """Return the cells of a column as text, (n,)."""
         return [text_of(cell) for cell in self._column(column)]
 
+    def top(self, count: int) -> SheetCells:
+        """Return the first rows, at most ``count``."""
+        return SheetCells(self._rows[:count], self.lines[:count].tolist(), self._width)
+
     def numbers(self, columns: Sequence[int]) -> dict[int, Array]:
         """Return the columns that contain numbers only, (n,) each."""
         found = {}

@@ -44,6 +44,10 @@ class Cells(ABC):
         """Return the cells of a column as text, (n,)."""
 
     @abstractmethod
+    def top(self, count: int) -> Cells:
+        """Return the first rows, at most ``count``."""
+
+    @abstractmethod
     def numbers(self, columns: Sequence[int]) -> dict[int, Array]:
         """Return columns that are known to contain numbers and empty cells only, (n,) each; others are left out."""
 

@@ -7,8 +7,9 @@ import io
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,9 @@ def text_table(data: bytes, path: Path, form: Format) -> Table:
         form = form.model_copy(update={"delimiter": match[1] if form.delimiter == "auto" else form.delimiter})
     if lines[0].startswith("LabVIEW Measurement"):
         start = max(start, _after_lvm_header(lines, path))
-    kept = [k for k in range(start, len(lines)) if lines[k].strip() and not _is_comment(lines[k], form)]
+    kept = [k for k in range(start, len(lines)) if lines[k] and not lines[k].isspace()]
+    if form.comment in text:
+        kept = [k for k in kept if not _is_comment(lines[k], form)]
     if form.delimiter == "auto":
         head = [lines[k] for k in kept[: recognition.SAMPLE]]
         form = form.model_copy(update={"delimiter": delimiter_of(recognition.spread(head), form.missing)})
@@ -221,10 +224,14 @@ class _TextCells(Cells):
         if column not in self._known:
             if self._regular:
                 frame = self._frame([column], str)
-                self._known[column] = [text.strip() for text in frame[column]]
+                self._known[column] = [text.strip() for text in frame[column].tolist()]
             else:
                 self._known[column] = [fields[column] for _, fields in self._split[0]]
         return self._known[column]
+
+    def top(self, count: int) -> _TextCells:
+        """Return the first rows, at most ``count``, of as many lines."""
+        return replace(self, last=min(self.last, self.first + count - 1), notes=[], _known={})
 
     def numbers(self, columns: Sequence[int]) -> dict[int, Array]:
         """Return the columns that contain numbers only, (n,) each."""
@@ -245,9 +252,12 @@ class _TextCells(Cells):
         if (
             len(rows) <= _MANY
             or self.source[self.head_line] in rows
-            or any(_is_comment(row, self.form) for row in rows)
+            or (self.form.comment in self._text and any(_is_comment(row, self.form) for row in rows))
         ):
             return False
+        if self.form.delimiter != " " and '"' not in self._text:
+            fields = self.body.width - 1
+            return fields > 0 and set(map(str.count, rows, repeat(self.form.delimiter))) == {fields}
         try:
             last = self.body.width - 1
             frame = self._frame([last], str)
