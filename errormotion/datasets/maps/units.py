@@ -11,14 +11,27 @@ from errormotion.datasets.text.table_reader import unit_of_freedom
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
+_FORMS = """
+um: µm, mu, mü, my, micron, microns, mikrometer
+mm: millimeter
+degC: c, °c, deg c, grad c, celsius
+degF: f, °f
+s: sek, sec, secs, seconds, sekunden
+min: minuten, minutes
+h: std, stunden, hours, hrs
+ms: msec
+day: tage, days, d
+/min: u/min, upm, rev/min
+deg: °
+arcsec: ", '', ´´, arc sec, sec of arc, winkelsekunden
+urad: µrad, mikrorad
+um/m: µm/m
+%: %rh, % rh, %rf, % r.f.
+"""
 _WRITTEN = {
-    **{"µm": "um", "mu": "um", "mü": "um", "my": "um", "micron": "um", "microns": "um", "mikrometer": "um"},
-    **{"c": "degC", "°c": "degC", "deg c": "degC", "grad c": "degC", "celsius": "degC", "f": "degF", "°f": "degF"},
-    **{"sek": "s", "sec": "s", "secs": "s", "seconds": "s", "sekunden": "s", "minuten": "min", "minutes": "min"},
-    **{"std": "h", "stunden": "h", "hours": "h", "hrs": "h", "msec": "ms", "tage": "day", "days": "day", "d": "day"},
-    **{"u/min": "/min", "upm": "/min", "rev/min": "/min", "°": "deg", '"': "arcsec", "''": "arcsec", "´´": "arcsec"},
-    **{"arc sec": "arcsec", "sec of arc": "arcsec", "winkelsekunden": "arcsec", "µrad": "urad", "mikrorad": "urad"},
-    **{"%rh": "%", "% rh": "%", "%rf": "%", "% r.f.": "%", "millimeter": "mm", "µm/m": "um/m"},
+    form: unit
+    for unit, _, forms in (line.partition(": ") for line in _FORMS.strip().splitlines())
+    for form in forms.split(", ")
 }
 """Units of programs that have another form or no meaning elsewhere, in lower case."""
 _UNCLEAR = ("grad",)
