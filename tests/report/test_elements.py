@@ -19,6 +19,7 @@ from errormotion.report.elements import (
     Curves,
     FigureBudget,
     KeyFigures,
+    KeyValue,
     Map,
     Of,
     On,
@@ -482,3 +483,40 @@ def test_curves_along_a_dim_without_scale_are_drawn_over_their_own_places():
     )
     x = [[float(v) for v in re.findall(r"[ML] ([\d.]+) ", found[1])] for found in (first, second)]
     assert x[1][1] - x[1][0] == pytest.approx(2 * (x[0][1] - x[0][0]), abs=0.03)
+
+
+def test_numbers_at_the_head_are_of_one_value_or_reduced_and_unknown_ones_are_left_out():
+    ds = xr.Dataset(
+        {
+            "residual": (("time", "touch"), 1e-6 * np.array([[3.0, np.nan], [4.0, 0.0]]), {"units": "m"}),
+            "ratio": ((), 1.5),
+            "lost": ((), np.nan),
+        }
+    )
+    parts = (
+        KeyValue(
+            "residual", Column("residual", format=".2", signed=False, reduce="rms"), lambda ds: f"{ds.sizes['time']}"
+        ),
+        KeyValue("ratio", Column("ratio", signed=False), "of two"),
+        KeyValue("lost", Column("lost")),
+        KeyValue("absent", Column("absent")),
+    )
+    made = [each for part in parts for each in part.key_figures(Source(ds))]
+    assert [(each.label, each.value.text, each.unit, each.note) for each in made] == [
+        ("residual", "2.89", "µm", "2"),  # sqrt((9 + 16 + 0) / 3)
+        ("ratio", "1.500", "", "of two"),
+    ]
+
+
+def test_the_last_row_of_a_table_reduces_all_values():
+    ds = xr.Dataset({"residual": (("ball", "touch"), 1e-6 * np.array([[3.0, np.nan], [4.0, 0.0]]), {"units": "m"})})
+    columns = (
+        Column("residual", head="rms", format=".2", signed=False, reduce="rms"),
+        Column("residual", head="first", format=".0", signed=False, select={"touch": 0}),
+    )
+    (table,) = Table("Residuals.", columns, over="ball", total="all").blocks(Source(ds), "k")
+    assert [[str(getattr(cell, "text", cell)) for cell in row] for row in table.rows] == [
+        ["ball 1", "3.00", "3"],
+        ["ball 2", "2.83", "4"],
+        ["all", "2.89", ""],
+    ]

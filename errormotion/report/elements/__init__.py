@@ -18,9 +18,11 @@ from errormotion.report.elements.standard import (
     Notes,
     Provenance,
     Reliability,
+    Sensors,
     Spans,
 )
-from errormotion.report.elements.tables import Column, Table
+from errormotion.report.elements.tables import Column, KeyValue, Table
+from errormotion.report.elements.timelines import LargestAndLast, Timeline
 
 __all__ = [
     "PROVENANCE",
@@ -36,6 +38,8 @@ __all__ = [
     "FigureTable",
     "Further",
     "KeyFigures",
+    "KeyValue",
+    "LargestAndLast",
     "Map",
     "Notes",
     "Of",
@@ -45,7 +49,9 @@ __all__ = [
     "Provenance",
     "Reliability",
     "Section",
+    "Sensors",
     "Sentence",
     "Spans",
     "Table",
+    "Timeline",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import xarray as xr
@@ -14,7 +14,7 @@ from errormotion.report import document
 from errormotion.report.document import Block, Cell, Part, Source, estimate
 from errormotion.report.elements.figures import KeyFigures, chosen
 from errormotion.report.elements.quantities import Of, unit_of
-from errormotion.report.elements.tables import filled
+from errormotion.report.elements.tables import KeyValue, filled
 from errormotion.report.text import DASH
 
 _NAME = re.compile(r"\{([^{}]+)\}")
@@ -114,25 +114,18 @@ class On:
     """Parts that read another dataset than the whole one: a selection, or one with further variables and attributes.
 
     ``choose`` returns it, or several, for each of which the parts are repeated; None where the parts do not apply,
-    which leaves them out. In a chapter the parts are sections.
+    which leaves them out. In a chapter the parts are those of a chapter.
     """
 
     choose: Callable[[xr.Dataset], xr.Dataset | Sequence[xr.Dataset] | None]
-    parts: Sequence[Element | Section]
+    parts: Sequence[Element | Head]
 
     def blocks(self, source: Source, key: str) -> list[Block]:
         """Return the blocks of the parts for each chosen dataset."""
-        parts = [each for each in self.parts if not isinstance(each, Section)]
-        return [block for each, own in self._each(source, key) for k, part in enumerate(parts)
-                for block in part.blocks(each, f"{own}-{k}")]  # fmt: skip
+        return [block for each, own in self.each(source, key) for k, part in enumerate(self.parts)
+                for block in part.blocks(each, f"{own}-{k}")]  # type: ignore[union-attr] # fmt: skip
 
-    def sections(self, source: Source, key: str) -> list[document.Section]:
-        """Return the sections for each chosen dataset."""
-        sections = [each for each in self.parts if isinstance(each, Section)]
-        made = [section.made(each, own) for each, own in self._each(source, key) for section in sections]
-        return [section for section in made if section is not None]
-
-    def _each(self, source: Source, key: str) -> list[tuple[Source, str]]:
+    def each(self, source: Source, key: str) -> list[tuple[Source, str]]:
         """Return the source of each chosen dataset, and its key."""
         found = self.choose(source.errors)
         if found is None or isinstance(found, xr.Dataset):
@@ -158,6 +151,10 @@ class Section:
         return document.Section(name, title, blocks) if blocks else None
 
 
+Head = KeyFigures | KeyValue | Sentence | Section | On | Callable[[Source], Sequence[str]]
+"""A part of a chapter."""
+
+
 @dataclass(frozen=True)
 class Chapter:
     """A chapter as data.
@@ -167,30 +164,39 @@ class Chapter:
     title : str
         `{name}` is replaced by an attribute of the dataset.
     parts : sequence
-        In their order: key figures, sentences of the summary, sections, and sections `On` a selection.
+        In their order: key figures and values, sentences of the summary, sections, and such parts `On` selections.
     kind : str
         Title line of a report that starts with this chapter.
     """
 
     title: str
-    parts: Sequence[KeyFigures | Sentence | Section | On | Callable[[Source], Sequence[str]]]
+    parts: Sequence[Head]
     kind: str = "Test report"
 
     def made(self, source: Source, key: str = "") -> Part:
         """Return the chapter of a dataset; ``key`` distinguishes its drawings, by default the key of the source."""
-        keys, words, sections = list[document.KeyFigure](), list[str](), list[document.Section]()
-        later, key = list[str](), key or source.key
-        for k, each in enumerate(self.parts):
-            if isinstance(each, KeyFigures):
-                keys += each.key_figures(source)
-                later += each.sentences(source)
-            elif isinstance(each, Section):
-                section = each.made(source, key)
-                sections += [section] if section is not None else []
-            elif isinstance(each, On):
-                sections += each.sections(source, f"{key}-{k}")
-            elif isinstance(each, Sentence):
-                words += [text] if (text := each.text(source)) else []
-            else:
-                words += each(source)
-        return Part(filled(self.title, source.errors), keys, [*words, *later], sections, kind=self.kind)
+        made = Part(filled(self.title, source.errors), list[document.KeyFigure](), [], [], kind=self.kind)
+        later = list[str]()
+        _add(made, later, self.parts, source, key or source.key)
+        return replace(made, summary=[*made.summary, *later])
+
+
+def _add(made: Part, later: list[str], parts: Sequence[Any], source: Source, key: str) -> None:
+    """Add the parts to a chapter; sentences on large uncertainties to ``later``."""
+    keys, words, sections = (cast("list[Any]", each) for each in (made.key_figures, made.summary, made.sections))
+    for k, each in enumerate(parts):
+        if isinstance(each, KeyFigures):
+            keys += each.key_figures(source)
+            later += each.sentences(source)
+        elif isinstance(each, KeyValue):
+            keys += each.key_figures(source)
+        elif isinstance(each, On):
+            for chosen_source, own in each.each(source, f"{key}-{k}"):
+                _add(made, later, each.parts, chosen_source, own)
+        elif isinstance(each, Section):
+            section = each.made(source, key)
+            sections += [section] if section is not None else []
+        elif isinstance(each, Sentence):
+            words += [text] if (text := each.text(source)) else []
+        else:
+            words += each(source)

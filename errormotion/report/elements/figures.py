@@ -28,8 +28,8 @@ LARGE_OF_VALUE = 0.5
 INDEPENDENT = "independent"
 Names = Sequence[str] | Callable[[xr.Dataset], Sequence[str]]
 """Names of figures of merit, in which ``*`` stands for any characters, or a function of the dataset."""
-_PLACE = re.compile(r" at (.*)| \((.*)\)$")
-"""What follows the name of a figure at the head: its place, or the standard that defines it."""
+_PLACE = re.compile(r" at (.*)| (after .*)| \((.*)\)$")
+"""What follows the name of a figure at the head: its place, its time, or the standard that defines it."""
 _MOST = 8
 """Key figures; the table contains all."""
 _NAMED = 3
@@ -48,8 +48,8 @@ class KeyFigures:
     units : mapping of str to str
         Unit on the page by the SI unit, keys of `quantities.UNITS`; by default um and arcsec.
     note : str
-        Below each figure that has no limit; by default the place in its name, which follows " at ", or the standard
-        in parentheses at its end.
+        Below each figure that has no limit; by default the place or time in its name, which follows " at " or
+        " after ", or the standard in parentheses at its end.
     signed : bool
         Whether a positive value has a plus sign.
     """

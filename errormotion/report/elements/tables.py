@@ -90,6 +90,34 @@ class Column(Of):
         return Cell(f"+{text}" if self.signed and value > 0 else text)
 
 
+@dataclass(frozen=True)
+class KeyValue:
+    """A number at the head of the chapter that is no figure of merit; nothing if it is unknown.
+
+    Attributes
+    ----------
+    label : str
+    value : Column
+        A quantity of one value, or reduced to one.
+    note : str or callable
+        Below it; a function of the dataset.
+    """
+
+    label: str
+    value: Column
+    note: str | Callable[[xr.Dataset], str] = ""
+
+    def key_figures(self, source: Source) -> list[document.KeyFigure]:
+        """Return the number for the head of the chapter."""
+        ds = source.errors
+        quantity = self.value.read(ds)
+        if quantity is None:
+            return []
+        cell = _single(self.value, quantity)
+        note = self.note(ds) if callable(self.note) else self.note
+        return [] if cell.text == DASH else [document.KeyFigure(self.label, cell, quantity.unit, note)]
+
+
 def _name_of(ds: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:
     """Return a place in field units; along a single coordinate of texts its text alone, as the head names the dim."""
     if len(dims) == 1 and dims[0] in ds.coords and ds[dims[0]].dtype.kind in "UO":
@@ -125,6 +153,8 @@ class Table:
         Below the table; a function of the dataset returns several.
     absent : str
         A note in place of the table if there is nothing to show.
+    total : str
+        Name of a last row, in which the columns reduce the values of all rows; none by default.
     """
 
     caption: str
@@ -137,6 +167,7 @@ class Table:
     groups: Sequence[tuple[str, int]] = ()
     notes: Sequence[str | Callable[[xr.Dataset], Sequence[str]]] = ()
     absent: str = ""
+    total: str = ""
 
     def __post_init__(self) -> None:
         if not self.over:
@@ -174,11 +205,20 @@ class Table:
             own = slice(1, None) if len(over) > 1 else slice(None)
             name = place(ds, over[own], index[own]) or f"{over[-1]} {index[-1] + 1}"
             rows.append([name, *_once([column[tuple(index)] for column in made])])
+        if self.total:
+            whole = zip(columns, found, strict=True)
+            rows.append([self.total, *(_single(each, q) if q and each.reduce else Cell("") for each, q in whole)])
         heads = [column.title(each) for column, each in zip(columns, found, strict=True)]
         more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
         notes = [note for each in self.notes for note in (each(ds) if callable(each) else [each])]
         head = [self.head or over[-1], *heads]
         return [document.Table(filled(self.caption, ds), head, rows, self.groups, notes=[*notes, *more])]
+
+
+def _single(column: Column, quantity: Quantity) -> Cell:
+    """Return the cell of a quantity of one value, or reduced to one."""
+    cell: Cell = _column(xr.Dataset(coords={"place": [0]}), column, quantity, ["place"], [1])[0]
+    return cell
 
 
 def _once(cells: Sequence[Cell]) -> list[Cell]:

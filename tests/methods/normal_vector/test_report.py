@@ -10,9 +10,11 @@ import pytest
 import xarray as xr
 
 from errormotion.methods.normal_vector import NormalVector, simulation
+from errormotion.methods.normal_vector.report import chapters
+from errormotion.methods.normal_vector.report.balls import MISSING, MOVED, WRONG, displacement, well_known
 from errormotion.methods.normal_vector.report.drawings import balls
-from errormotion.methods.normal_vector.report.view import MISSING, MOVED, WRONG, probing
 from errormotion.report import write_report
+from errormotion.report.document import Source
 from errormotion.report.drawings.timeline import clock
 from errormotion.report.page.language import Catalogue
 from errormotion.report.text import fixed
@@ -92,7 +94,7 @@ def test_all_sections_are_in_order(folder):
     html = page(clean, folder)
     places = [html.index(f"<h2>{title}</h2>") for title in HEADINGS]
     assert places == sorted(places)
-    assert html.count("<figure") == 4  # no map: the twin says no places
+    assert html.count("<figure") == 5  # no map: the twin says no places
 
 
 def test_page_needs_no_network_and_runs_no_script(folder):
@@ -131,11 +133,11 @@ def test_displacements_of_the_balls_are_those_of_the_dataset(folder):
 
 
 def test_enlargement_that_is_reported_is_the_one_that_is_drawn():
-    seen = probing(*clean())
-    figure = balls(seen, "k")
+    errors, _ = clean()
+    (figure,) = balls(Source(errors), "k")
     factor = int(re.search(r"magnified (\d[\d\u202f]*) times", figure.caption)[1].replace("\u202f", ""))
-    span = np.linalg.norm(np.ptp(seen.centre[0], axis=0))
-    longest = np.linalg.norm(seen.displacement, axis=2).max()
+    span = np.linalg.norm(np.ptp(errors["centre"].values[0], axis=0))
+    longest = np.linalg.norm(displacement(errors), axis=2).max()
     assert 0.02 * span < factor * longest < 0.25 * span
     assert f"{fixed(longest / UM, 1)} µm" in figure.caption
 
@@ -154,7 +156,7 @@ def test_cost_of_the_normals_is_a_number_and_a_curve(folder):
 def test_residuals_are_counted_by_ball_and_by_reason(folder):
     errors, _ = troubled()
     out, residual = errors["left_out"].values, errors["residual"].values
-    found = rows(page(troubled, folder), "The touches by ball")[2:]
+    found = rows(page(troubled, folder), "The readings of each ball")[2:]
     for i, row in enumerate(found[:-1]):
         counted = [int((out[:, i] == code).sum()) for code in (0, MISSING, WRONG, MOVED)]
         assert [int(cell) for cell in row[1:5]] == counted
@@ -203,13 +205,14 @@ def test_notes_of_the_result_are_in_the_german_catalogue(variant, noise):
 
 
 def test_centre_that_lost_its_top_touch_is_not_drawn_as_a_displacement():
-    seen = probing(*clean())
-    assert seen.well_known.all()
-    seen.centre_u[4, 2, 2] = 30 * UM
-    seen.displacement[4, 2, 2] = 500 * UM
-    assert not seen.well_known[4, 2]
-    assert "500" not in balls(seen, "k").caption
-    assert "Not drawn: 1 centres" in balls(seen, "k").caption
+    errors = clean()[0].copy(deep=True)
+    assert well_known(errors).all()
+    errors["centre_covariance"].loc[{"time": errors["time"][4]}][2, 2, 2] = (30 * UM) ** 2
+    errors["ball_displacement"].loc[{"time": errors["time"][4]}][2, 2] = 500 * UM
+    assert not well_known(errors)[4, 2]
+    (figure,) = balls(Source(errors), "k")
+    assert "500" not in figure.caption
+    assert "Not drawn: 1 centres" in figure.caption
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -306,11 +309,13 @@ def test_cycles_that_are_all_unknown_are_reported(tmp_path):
     assert "No cycle determines the errors" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_flags_of_another_raw_dataset_are_not_used():
     errors, raw = clean()
-    assert probing(errors, raw).flag is not None
-    assert probing(errors, raw.isel(time=slice(0, 4))).flag is None
-    assert probing(errors, xr.Dataset()).flag is None
+    for given, stated in ((raw, True), (raw.isel(time=slice(0, 4)), False), (xr.Dataset(), False), (None, False)):
+        (part,) = chapters(Source(errors, given))
+        words = [block.text for section in part.sections for block in section.blocks if hasattr(block, "text")]
+        assert ("The probe flagged no touch." in words) is stated
 
 
 @pytest.mark.parametrize(("span", "unit"), [(60.0, "s"), (3600.0, "min"), (86400.0, "h"), (30 * 86400.0, "days")])

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from errormotion.methods.normal_vector.report import chapter, view
+from errormotion.methods.normal_vector.report.chapter import CHAPTER
 from errormotion.report.document import Part, Source
 from errormotion.report.page.language import texts_of
 
 
 def chapters(source: Source) -> list[Part]:
     """Return the chapter of a result over time; none for other results."""
-    return [chapter.part(source, source.key)] if view.is_normal_vector(source.errors) else []
+    return [CHAPTER.made(source)] if source.errors["EX"].dims == ("time",) else []
 
 
 def texts(language: str) -> dict[str, str]:
