@@ -23,8 +23,8 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.drawings import timeline
+from errormotion.report.elements import sensors
 from errormotion.report.page.language import texts_of
-from errormotion.report.parts import sensors
 from errormotion.report.text import fixed, integer, listed, percent
 
 _LISTED = 20

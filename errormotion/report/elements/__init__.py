@@ -10,6 +10,7 @@ from errormotion.report.elements.drawings import Curves, Map, PolarPlot
 from errormotion.report.elements.figures import FigureBudget, FigureTable, KeyFigures
 from errormotion.report.elements.limits import AgainstLimits
 from errormotion.report.elements.quantities import Of
+from errormotion.report.elements.sensors import Sensors
 from errormotion.report.elements.standard import (
     PROVENANCE,
     UNCERTAINTY,
@@ -18,7 +19,6 @@ from errormotion.report.elements.standard import (
     Notes,
     Provenance,
     Reliability,
-    Sensors,
     Spans,
 )
 from errormotion.report.elements.tables import Column, KeyValue, Table

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from errormotion.arrays import Array
 from errormotion.datasets.results.places import place_of
 from errormotion.report import budget, document, provenance, quality
 from errormotion.report.budget import FREEDOMS
@@ -16,7 +15,6 @@ from errormotion.report.document import Block, Cell, Source, Text, or_dash
 from errormotion.report.elements.chapter import Section
 from errormotion.report.elements.quantities import FIELD, unit_of
 from errormotion.report.elements.tables import Column, Table
-from errormotion.report.parts import sensors
 from errormotion.report.text import DASH, decimals_of, finite, fixed, percent, significant
 
 UNSEEN = "not observed by this method"
@@ -139,21 +137,6 @@ class Reliability:
 def _used(errors: xr.Dataset) -> xr.DataArray:
     """Return the residuals of the readings used."""
     return errors["residual"].where(errors["left_out"] == 0).assign_attrs(errors["residual"].attrs)
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """The temperature sensors: their places on the machine as a map, their temperatures as a table.
-
-    ``others`` returns names and places (k, 3) in m of further points of the map, which are drawn for orientation.
-    """
-
-    others: Callable[[xr.Dataset], tuple[Sequence[str], Array] | None] | None = None
-
-    def blocks(self, source: Source, key: str) -> list[Block]:
-        """Return the drawing and the table; a note without temperatures."""
-        others = self.others(source.errors) if self.others is not None else None
-        return sensors.blocks(sensors.of_dataset(source.errors, source), key, others)
 
 
 @dataclass(frozen=True)

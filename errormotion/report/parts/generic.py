@@ -21,10 +21,7 @@ from errormotion.report.elements import (
     Section,
 )
 from errormotion.report.elements.standard import RELIABILITY
-from errormotion.report.fields import unit_of
 from errormotion.report.text import listed
-
-unit_at = unit_of
 
 
 def _values(source: Source, key: str) -> list[Block]:  # noqa: ARG001 - a table has no identifiers

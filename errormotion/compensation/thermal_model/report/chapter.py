@@ -11,8 +11,8 @@ from errormotion.report import budget, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Figure, KeyFigure, Part, Section, Source, Table, Text, estimate
 from errormotion.report.drawings import timeline
-from errormotion.report.parts import sensors
-from errormotion.report.parts.generic import unit_at
+from errormotion.report.elements import sensors
+from errormotion.report.fields import unit_of
 from errormotion.report.text import fixed, integer, listed, percent
 
 _PREDICTED = (
@@ -72,7 +72,7 @@ def _key_figures(errors: xr.Dataset) -> list[KeyFigure]:
     found = []
     when = f"after {fixed(float(errors['time'].values[last]) / 60, 1)} min"
     for i, name in enumerate(FREEDOMS):
-        unit, size = unit_at(i)
+        unit, size = unit_of(i)
         value, sigma = float(errors[name].values[last]), timeline.sigma(errors, i)[last]
         if math.isfinite(value):
             found.append(KeyFigure(name, estimate(value / size, 2 * sigma / size), unit, when))

@@ -28,9 +28,8 @@ from errormotion.report.document import (
     or_dash,
 )
 from errormotion.report.drawings import timeline
-from errormotion.report.fields import remarks
-from errormotion.report.parts import sensors
-from errormotion.report.parts.generic import unit_at
+from errormotion.report.elements import sensors
+from errormotion.report.fields import remarks, unit_of
 from errormotion.report.text import DASH, fixed, integer, listed, significant
 
 COVERAGE_FACTOR = 1.96
@@ -94,7 +93,7 @@ def _seen(numbers: Mapping[str, np.ndarray]) -> list[int]:
 def _key_figures(numbers: Mapping[str, np.ndarray]) -> list[KeyFigure]:
     found = []
     for i in _seen(numbers):
-        unit, size = unit_at(i)
+        unit, size = unit_of(i)
         spans = [fixed(numbers[name][i] / size, 2) for name in ("rms", "remaining")]
         note = f"removed; rms {spans[0]} to {spans[1]} {unit}"
         found.append(KeyFigure(FREEDOMS[i], Cell(_share(numbers["removed"][i])), "%", note))
@@ -129,7 +128,7 @@ def _sources(model: xr.Dataset) -> list[str]:
 
 def _series(predicted: xr.Dataset, measured: xr.Dataset, i: int) -> tuple[np.ndarray, ...]:
     """Return predicted, its standard uncertainty, measured and its standard uncertainty, in the unit of the page."""
-    size, name = unit_at(i)[1], FREEDOMS[i]
+    size, name = unit_of(i)[1], FREEDOMS[i]
     pairs = [(np.asarray(ds[name].values, float), timeline.sigma(ds, i)) for ds in (predicted, measured)]
     return tuple(values / size for pair in pairs for values in pair)
 
@@ -143,7 +142,7 @@ def _six(predicted: xr.Dataset, paint: Any, key: str) -> Any:
         out = thermal_model.is_outside(predicted)
         for i, name in enumerate(FREEDOMS):
             axes: Axes = panels[i % 3, i // 3]
-            axes.set_title(f"{name} / {unit_at(i)[0]}")
+            axes.set_title(f"{name} / {unit_of(i)[0]}")
             if not paint(axes, time.values, i):
                 axes.text(0.5, 0.5, "not compared", transform=axes.transAxes, ha="center", va="center", color="#555555")
                 axes.set_yticks([])
@@ -179,7 +178,7 @@ def _curves(predicted: xr.Dataset, measured: xr.Dataset, key: str) -> Block:
         both = np.flatnonzero(np.isfinite(p) & np.isfinite(m))
         if both.size:
             k = both[-1]
-            words.append(f"{name} last {fixed(p[k], 2)} predicted, {fixed(m[k], 2)} measured {unit_at(i)[0]}")
+            words.append(f"{name} last {fixed(p[k], 2)} predicted, {fixed(m[k], 2)} measured {unit_of(i)[0]}")
     return Figure(_six(predicted, paint, key), caption, f"Predicted and measured over time: {'; '.join(words)}.")
 
 
@@ -208,7 +207,7 @@ def _residuals(predicted: xr.Dataset, measured: xr.Dataset, numbers: Mapping[str
         f"the difference; red: outside.{_background(predicted)}"
     )
     words = "; ".join(
-        f"{FREEDOMS[i]} {fixed(numbers['remaining'][i] / unit_at(i)[1], 2)} {unit_at(i)[0]}" for i in _seen(numbers)
+        f"{FREEDOMS[i]} {fixed(numbers['remaining'][i] / unit_of(i)[1], 2)} {unit_of(i)[0]}" for i in _seen(numbers)
     )
     return Figure(_six(predicted, paint, key), caption, f"Residuals over time; root mean squares: {words}.")
 
@@ -218,7 +217,7 @@ def _table(numbers: Mapping[str, np.ndarray], model: xr.Dataset) -> Table:
     misfit = np.asarray(model["misfit"].values, float)
     rows: list[list[Cell | str]] = []
     for i, name in enumerate(FREEDOMS):
-        unit, size = unit_at(i)
+        unit, size = unit_of(i)
         spans = [fixed(numbers[what][i] / size, 2) for what in ("rms", "remaining")]
         shares = [_share(numbers[what][i]) for what in ("removed", "held")]
         stated = [_share(own[i]), fixed(COVERAGE_FACTOR * misfit[i] / size, 2)]
@@ -281,7 +280,7 @@ def _coefficients_of(model: xr.Dataset, freedoms: range, what: str) -> Table:
     for k, name in enumerate(model["feature"].values):
         cells = []
         for i in freedoms:
-            size = unit_at(i)[1]
+            size = unit_of(i)[1]
             sigma = math.sqrt(variance[i, k]) if variance[i, k] >= 0 else math.nan
             cells.append(estimate(coefficient[i, k] / size, 2 * sigma / size, reason=_UNKNOWN))
         low, high = (significant(float(model[side].values[k]), 3) for side in ("feature_low", "feature_high"))
@@ -289,7 +288,7 @@ def _coefficients_of(model: xr.Dataset, freedoms: range, what: str) -> Table:
     return Table(
         f"Coefficients of the {what}: error per unit of each input. After ±: expanded uncertainty, k = 2; the "
         "coefficients of one error are correlated. Range: of the input in training.",
-        ["input", "unit", "range", *(f"{FREEDOMS[i]} / {unit_at(i)[0]}" for i in freedoms)],
+        ["input", "unit", "range", *(f"{FREEDOMS[i]} / {unit_of(i)[0]}" for i in freedoms)],
         rows,
     )
 

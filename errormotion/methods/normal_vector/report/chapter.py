@@ -30,10 +30,10 @@ from errormotion.report.elements import (
     Sentence,
     Table,
     Timeline,
+    sensors,
 )
 from errormotion.report.elements.chapter import written
 from errormotion.report.fields import unit_of
-from errormotion.report.parts import sensors
 from errormotion.report.provenance import read
 from errormotion.report.text import finite, fixed, integer, listed
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,21 @@ _WARMER = ("#6f7680", "#B07800", "#D55E00", "#96280a")
 _WIDE, _HIGH = 110.0, 18.0
 _MAX_GAPS = 60
 _MIN_CHANGE = 0.5  # K; smaller changes are not coloured
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """The temperature sensors: their places on the machine as a map, their temperatures as a table.
+
+    ``others`` returns names and places (k, 3) in m of further points of the map, which are drawn for orientation.
+    """
+
+    others: Callable[[xr.Dataset], tuple[Sequence[str], Array] | None] | None = None
+
+    def blocks(self, source: Source, key: str) -> list[Block]:
+        """Return the drawing and the table; a note without temperatures."""
+        others = self.others(source.errors) if self.others is not None else None
+        return blocks(of_dataset(source.errors, source), key, others)
 
 
 @dataclass(frozen=True)
