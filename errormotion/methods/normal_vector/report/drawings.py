@@ -88,7 +88,8 @@ def _cold(errors: xr.Dataset) -> np.ndarray:
         return np.full((0, 3), np.nan)
     first = of.centres(errors)[0] - moved
     known = np.asarray(np.isfinite(first).all(axis=2))
-    return np.where(np.asarray(known.any(axis=0))[:, None], first[known.argmax(axis=0), np.arange(first.shape[1])], np.nan)
+    cold: np.ndarray = first[known.argmax(axis=0), np.arange(first.shape[1])]  # NaN where never known
+    return cold
 
 
 def _floor(cold: np.ndarray) -> float:
