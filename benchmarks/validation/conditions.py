@@ -48,10 +48,12 @@ CASES = (
     Case("linear_positioning", "diagonals", "diagonal_deviation", 0.3e-6, "run", "stop"),
     Case("spindle_drift", "drift", "distance", 3e-9, "", "time"),
     Case("beam_direction", "", "distance", 1e-6),
-    Case("multilateration", "", "displacement", 0.2e-6),
+    Case("multilateration", "", "displacement", 0.5e-6),
     Case("normal_vector", "", "touch", 0.25e-6),
     Case("r_test", "three spheres", "displacement", 0.2e-6, "", "angle"),
     Case("crossbeam_scan", "scan", "height", 0.5e-6, "", "profile"),
+    Case("crossbeam_scan", "registrations", "displacement", 0.1e-6),
+    Case("spindle_error_motion", "five sensors", "displacement", 5e-9, "", "time"),
     Case("circular_test", "", "length", 0.2e-6, "run", "sample"),
 )
 

@@ -22,7 +22,7 @@ SEEDS = nominal.SEEDS
 Z95 = 1.959964
 METHODS = (
     *("beam_direction", "circular_test", "crossbeam_scan", "linear_positioning", "multilateration"),
-    *("normal_vector", "r_test", "spindle_drift"),
+    *("normal_vector", "r_test", "spindle_drift", "spindle_error_motion"),
 )
 SLOW = {("crossbeam_scan", "scan")}
 """Subjects of which 200 seeds suffice."""

@@ -39,8 +39,8 @@ _ENOUGH = 6
 """Different readings that are no multiples of a step by accident: the probability is ``12 (2e-3)^4``."""
 _TIES = 2
 """Equal readings that prove a step: unrounded readings are never equal."""
-_NOTICEABLE = 0.02
-"""Part of a variance."""
+NOTICEABLE = 0.02
+"""Part of a variance from which on rounding is added to it."""
 _PRECISION = 16 * float(np.finfo(float).eps)
 
 
@@ -143,7 +143,7 @@ def rounding(problem: Problem, sd: Array, steps: float | Array | None = None) ->
             noise = np.array([noise_before(float(q), float(s)) for s in levels])
             added[:, k] = common(float(q), noise)[which] * repeats
             before[k] = np.median(noise[which])
-    if not (np.square(added) > _NOTICEABLE * np.square(sd)).any():
+    if not (np.square(added) > NOTICEABLE * np.square(sd)).any():
         return None
     worst = int(np.argmax(steps))
     return Rounding(float(steps[worst]), added, float(before[worst]))
@@ -163,7 +163,7 @@ def rounding_of_means(sd: Array, count: Array, step: float) -> Rounding | None:
         return None
     noise = noise_before(step, float(np.median(sd * np.sqrt(np.maximum(count, 1)))))
     b = float(common(step, noise))
-    return Rounding(step, np.full(sd.shape, b), noise) if b**2 > _NOTICEABLE * float(np.median(sd)) ** 2 else None
+    return Rounding(step, np.full(sd.shape, b), noise) if b**2 > NOTICEABLE * float(np.median(sd)) ** 2 else None
 
 
 def sentence(what: str, rounding: Rounding, unit: str = "m") -> str:

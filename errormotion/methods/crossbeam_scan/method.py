@@ -26,7 +26,7 @@ class CrossbeamScan(ModelMethod):
         id="crossbeam_scan",
         summary="Six thermal errors of a crossbeam's axis from repeated scans of artefacts with a line profiler",
         status="simulated_only",
-        version="4",
+        version="5",
         cannot_see=(
             "errors of the cold machine: all errors are relative to the cold scans",
             "motion of the table and its artefacts together with the crossbeam",

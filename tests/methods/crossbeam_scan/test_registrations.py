@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from errormotion.methods.crossbeam_scan import simulation
+from errormotion.methods.crossbeam_scan.conformance import subjects
 from errormotion.methods.crossbeam_scan.identification.cutting import Scans
 from errormotion.methods.crossbeam_scan.identification.registration import prepare, register
-from errormotion.methods.crossbeam_scan.identification.registrations import STRAINS, _of_strains, register_all
+from errormotion.methods.crossbeam_scan.identification.registrations import (
+    STRAINS,
+    Registrations,
+    _of_strains,
+    register_all,
+)
 from errormotion.methods.crossbeam_scan.settings import CrossbeamScanSettings
 from errormotion.twin.sensors.profiler import Profiler
 
@@ -23,8 +29,8 @@ def test_points_too_far_apart_for_the_relief_are_reported(gantry, pitch, notes):
     profiler = Profiler(400, pitch)
     raw = simulation.raw_scans(gantry, [0, 3600], [0.1], seed=1, profiler=profiler, profiles=200, feed=70e-6)
     found = register_all(Scans(raw), [0], 0.5e-6, CrossbeamScanSettings())
-    assert len(found.notes) == notes
-    assert all("Reduce the pitch of points and lines" in note for note in found.notes)
+    assert len(found.doubts) == notes
+    assert all("Reduce the pitch of points and lines" in note for note in found.doubts)
 
 
 def test_error_of_a_registration_by_strains_that_it_does_not_estimate():
@@ -52,3 +58,17 @@ def test_error_of_a_registration_by_strains_that_it_does_not_estimate():
             expected = e * effect[part]
             assert found.twist[part] == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
             assert as_estimated[part] == pytest.approx(effect[part], abs=0.02 * np.abs(effect[part]).max())
+
+
+def test_the_rounding_of_registrations_by_other_software_is_part_of_their_uncertainty():
+    raw, _ = next(each for each in subjects() if each.name == "registrations").make(0)
+    step = 1e-6
+    before = raw["displacement"]
+    rounded = raw.assign(displacement=(before.dims, np.round(before.values / step) * step, before.attrs))
+    exact, found = Registrations.stated(raw), Registrations.stated(rounded)
+    added = (found.covariance - exact.covariance)[1:]
+    assert added[..., :3, :3] == pytest.approx(np.broadcast_to(step**2 / 12 * np.eye(3), added[..., :3, :3].shape))
+    assert not added[..., 3:, :].any()
+    assert (found.covariance[0] == 0).all()
+    assert exact.notes == []
+    assert "multiples of 1 um" in found.notes[0]

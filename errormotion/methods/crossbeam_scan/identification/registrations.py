@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from errormotion.arrays import Array
 from errormotion.errors import MethodError
+from errormotion.estimation.checks.resolution import NOTICEABLE, step_of
 from errormotion.methods.crossbeam_scan.identification.cutting import Scan
 from errormotion.methods.crossbeam_scan.identification.registration import BlockMap, Registration, prepare, register
 from errormotion.methods.crossbeam_scan.identification.registration.freedoms import Extra
@@ -82,8 +83,8 @@ class Registrations:
         Of each scan, s.
     maps : list of Maps or None
         By artefact.
-    notes : list of str
-        Notes for the user.
+    notes, doubts : list of str
+        Notes for the user, and those that doubt the stated uncertainties.
     """
 
     cold: NDArray[np.int64]
@@ -97,6 +98,7 @@ class Registrations:
     time: Array
     maps: list[Maps | None] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     @classmethod
     def empty(cls, cycles: int, artefacts: int, cold: ArrayLike = -1) -> Registrations:
@@ -137,7 +139,24 @@ class Registrations:
             registrations.effect[..., :6, :] = values("strain_effect", "artefact", "registered", "strain")
         registrations.cold_share[:] = values("cold_share", "artefact")
         registrations.time[:] = values("time")[:, None]
+        registrations.add_rounding()
         return registrations
+
+    def add_rounding(self) -> None:
+        """Add the variance ``q^2 / 12`` (JCGM 100, F.2.2.1) of values that are multiples of a step q, with a note.
+
+        It is that of a single rounded value, which the covariance of another program does not contain.
+        """
+        for k, (what, unit) in enumerate((("displacements", "um"), ("rotations", "urad"))):
+            part = slice(3 * k, 3 * k + 3)
+            variance = np.einsum("caii->cai", self.covariance[1:, :, part, part])  # the cold ones are 0 by definition
+            step = step_of(self.twist[1:, :, part])
+            if (step**2 / 12 > NOTICEABLE * variance).any():
+                variance += step**2 / 12
+                self.notes.append(
+                    f"The {what} of the registrations are multiples of {1e6 * step:.3g} {unit}: rounding is a part of "
+                    "the uncertainties."
+                )
 
     def of_cycles(self, rows: Sequence[int], excluded: NDArray[np.bool_] | None = None) -> Registrations:
         """Return the registrations of some cycles, NaN where ``excluded`` (cycle, artefact) is True."""
@@ -215,7 +234,7 @@ def _artefact(
                 registrations.twist[cycle, k] = 0.0
                 registrations.covariance[cycle, k] = 0.0
                 registrations.cold_share[cycle, k] = 0.0
-                registrations.notes += _coarse(cold, k)
+                registrations.doubts += _coarse(cold, k)
                 registrations.quality["noise_found"][cycle, k] = cold.noise
                 registrations.quality["points_used"][cycle, k] = cold.points.sum()
                 continue

@@ -216,8 +216,14 @@ def observe(raw: xr.Dataset, settings: CrossbeamScanSettings) -> tuple[Observed,
         attrs={"registration": settings.registration, "strain": settings.strain, **for_frame},
         finish=lambda solved: _finished(solved, measured),
         record=None if measured else campaign.recorded,
-        notes=[*_notes(reason, positions, campaign.rig), *_strain_notes(settings), *check.notes, *corrected],
-        doubts=[*check.doubts, *registrations.notes],
+        notes=[
+            *_notes(reason, positions, campaign.rig),
+            *_strain_notes(settings),
+            *check.notes,
+            *registrations.notes,
+            *corrected,
+        ],
+        doubts=[*check.doubts, *registrations.doubts],
     )
     return observed, Evaluated(every, campaign, rows, cold, time, check, reason)
 
