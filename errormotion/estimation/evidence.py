@@ -15,10 +15,22 @@ weight w, and their differences are part of the covariance::
 
     x = sum w_p x_p,  C = sum w_p (C_p + (x_p - x) (x_p - x)')
 
-Terms that the data do not determine keep their prior, so that their possible size is contained in the covariance. The
-sizes tau are taken as known, which makes intervals somewhat short where few data determine them. Groups of one kind
-have similar sizes: if their logarithms have the standard deviation s, the size of the kind counts as much as
-``1 / (2 s^2)`` terms (`pooled`), since w terms determine ``ln tau`` to ``1 / sqrt(2 w)``.
+Terms that the data do not determine keep their prior, so that their possible size is contained in the covariance.
+Groups of one kind have similar sizes: if their logarithms have the standard deviation s, the size of the kind counts as
+much as ``1 / (2 s^2)`` terms (`pooled`), since w terms determine ``ln tau`` to ``1 / sqrt(2 w)``.
+
+Few data hardly determine the sizes. Their logarithms have the covariance S about the maximum (Laplace)::
+
+    Y = P^1/2 C P^1/2,  u = P^1/2 x
+    S^-1 = -d2 ln evidence / d ln tau d ln tau + 2 pooled (1 - mean over the kind)
+    -d2 ln evidence / d ln tau_g d ln tau_h = 2 [g = h] sum (u_i^2 + Y_ii) - sum (4 u_i Y_ij u_j + 2 Y_ij^2)
+
+with sums over i in g and j in h. Their mean exceeds the maximum by S_gg: the likelihood of w terms is that of an
+inverse chi-square distribution, with ``S = 1 / (2 w)`` and the third derivative 4 w. With ``dx = 2 C P_g x``,
+``dC = 2 C P_g C`` and ``d2 C = 8 C P_g C P_h C - 4 [g = h] C P_g C`` by ``ln tau`` the covariance becomes, to the
+second order (Kass, Steffey, J. Am. Stat. Assoc. 84 (1989) 717), and with S_ij of the groups of two coefficients,
+
+    C + 4 C P^1/2 [S_ij (Y_ij + u_i u_j)] P^1/2 C.
 """
 
 from __future__ import annotations
@@ -36,6 +48,8 @@ _FIRST_SIZE = 30.0
 """Size of a prior at the start, relative to the typical standard uncertainty of a single column."""
 _NO_WEIGHT = 1e-12
 """Weight of an exponent that is not counted."""
+_LARGEST_U = 1.0
+"""Standard deviation of the logarithm of a size that the data do not determine at all."""
 _NO_EFFECT = 1e-9
 """Column of which the data know nothing: its size relative to the largest."""
 
@@ -48,12 +62,16 @@ class Posterior:
     ----------
     value : ndarray, (column,)
     half : ndarray, (column, column)
-        Root of the covariance ``half' half``.
+        Root of the covariance ``half' half`` for these sizes.
+    of_sizes : ndarray, (column, column)
+        What the uncertainty of the sizes adds to it.
     determined : ndarray, (column,)
         Degree to which the data determine a column, from 0 (by its prior only) to 1.
     size : ndarray, (group,)
         Standard deviation tau of a coefficient of order 1, as estimated from these coefficients; at convergence that of
         their prior.
+    u_size : ndarray, (group,)
+        Standard uncertainty of its logarithm.
     exponent : float
         p of the priors ``tau n^-p``.
     evidence : float
@@ -62,14 +80,16 @@ class Posterior:
 
     value: Array
     half: Array
+    of_sizes: Array
     determined: Array
     size: Array
+    u_size: Array
     exponent: float
     evidence: float
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the coefficients, (column, column)."""
+        """Covariance of the coefficients for these sizes, (column, column)."""
         return np.asarray(self.half.T @ self.half)
 
 
@@ -81,9 +101,10 @@ class Averaged:
     ----------
     value : ndarray, (column,)
     covariance : ndarray, (column, column)
-        With the differences between the exponents.
+        With the uncertainty of the sizes, and the differences between the exponents.
     within : ndarray, (column, column)
-        Mean of the covariances for each exponent: the effect of nuisance parameters is that of `eliminated` with it.
+        Mean of the covariances for each exponent and its sizes: the effect of nuisance parameters is that of
+        `eliminated` with it.
     determined : ndarray, (column,)
         Degree to which the data determine a column, from 0 (by its prior only) to 1.
     parts : sequence of Posterior
@@ -105,7 +126,8 @@ class Averaged:
     def variance(self, order: ArrayLike) -> Array:
         """Return the mean prior variances (group, order) of coefficients of orders (order,)."""
         n = np.asarray(order, dtype=float)
-        each = [np.outer(part.size**2, n ** (-2 * part.exponent)) for part in self.parts]
+        # E tau^2 to the second order, as in the covariance
+        each = [np.outer(part.size**2 * (1 + 4 * part.u_size**2), n ** (-2 * part.exponent)) for part in self.parts]
         return np.asarray(np.einsum("p,pgn->gn", self.weight, each))
 
 
@@ -119,7 +141,7 @@ def averaged(parts: Sequence[Posterior]) -> Averaged:
     for w, each in zip(weight, parts, strict=True):
         if w > _NO_WEIGHT:
             within += w * each.covariance
-            spread += w * np.outer(each.value - value, each.value - value)
+            spread += w * (each.of_sizes + np.outer(each.value - value, each.value - value))
     determined = np.asarray(sum(w * each.determined for w, each in zip(weight, parts, strict=True)))
     return Averaged(value, within + spread, within, determined, parts, weight)
 
@@ -239,7 +261,32 @@ class _Search:
                 break
         evidence = float(self.b @ x) - log_det + float(np.log(prior[self.members]).sum())
         determined = 1 - variance * prior
-        return Posterior(x * self.unit, half * self.unit, determined, tau, exponent, evidence)
+        of_sizes, u_size = self._of_sizes(x, half, prior)
+        return Posterior(
+            value=x * self.unit,
+            half=half * self.unit,
+            of_sizes=of_sizes * np.outer(self.unit, self.unit),
+            determined=determined,
+            size=tau,
+            u_size=u_size,
+            exponent=exponent,
+            evidence=evidence,
+        )
+
+    def _of_sizes(self, x: Array, half: Array, prior: Array) -> tuple[Array, Array]:
+        """Return what the uncertainty of the sizes adds to the covariance, and that of their logarithms."""
+        root = np.sqrt(prior[self.members])
+        B = (half.T @ half[:, self.members]) * root  # C P^1/2
+        Y, u = root[:, None] * B[self.members], root * x[self.members]
+        one = np.equal.outer(np.arange(self.kind.size), self.group).astype(float)
+        second = one @ (4 * u[:, None] * Y * u + 2 * Y**2) @ one.T
+        A = 2 * np.diag(one @ (u**2 + np.diag(Y))) - second
+        same = np.equal.outer(self.kind, self.kind)
+        A += 2 * self.pooled * (np.eye(len(same)) - same / same.sum(axis=1))
+        values, vectors = np.linalg.eigh((A + A.T) / 2)
+        S = (vectors / np.maximum(values, _LARGEST_U**-2)) @ vectors.T
+        each = S[np.ix_(self.group, self.group)]
+        return B @ (4 * each * (Y + np.outer(u, u))) @ B.T, np.sqrt(np.diag(S))
 
 
 def _half_of_inverse(N: Array, prior: Array, rounding: float) -> tuple[Array, float]:

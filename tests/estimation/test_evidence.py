@@ -75,6 +75,47 @@ def test_intervals_contain_the_true_curve_if_the_data_determine_the_sizes():
     assert 0.93 <= np.mean(held) <= 0.97
 
 
+@pytest.mark.parametrize("count", [8, 20])
+def test_the_covariance_is_that_of_all_sizes(count):
+    """Against numerical integration over the size of one group; without, a standard deviation lacks up to a quarter."""
+    orders, found, known = np.arange(1.0, 7.0), [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        A = legendre.legvander(rng.uniform(-1, 1, count), 6)[:, 1:]
+        N, b = normal(A, A @ (rng.normal(size=6) / orders) + SIGMA * rng.normal(size=count))
+        [part] = posteriors(N, b, np.zeros(6, dtype=np.intp), orders, exponents=[1.0], tolerance=1e-8, passes=5000)
+        C = [np.linalg.inv(N + np.diag(orders / size) ** 2) for size in np.geomspace(0.05, 20.0, 600) * part.size[0]]
+        x = np.array([each @ b for each in C])
+        prior = [2 * np.log(orders / size).sum() for size in np.geomspace(0.05, 20.0, 600) * part.size[0]]
+        log = 0.5 * (x @ b + [np.linalg.slogdet(each)[1] for each in C] + prior)
+        weight = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+        mean = weight @ x
+        exact = weight @ np.array([np.diag(each) for each in C]) + weight @ (x - mean) ** 2
+        found.append(np.sqrt(np.diag(part.covariance + part.of_sizes) / exact))
+        known.append(np.sqrt(np.diag(part.covariance) / exact))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.05)
+    assert np.min(found) > 0.9
+    assert np.min(known) < 0.9  # the sizes matter
+
+
+def test_intervals_contain_the_true_curve_if_few_data_hardly_determine_the_sizes():
+    """Two curves of eight orders: with the sizes as known, the intervals contained 88 %."""
+    rng, held = np.random.default_rng(3), []
+    P = legendre.legvander(np.linspace(-1, 1, 21), ORDERS - 1)[:, 1:]
+    for _ in range(100):
+        A, x, y = readings(rng, (1.0, 0.5), 1.0, count=12)
+        found = averaged(
+            posteriors(
+                *normal(A, y), GROUP, ORDER, exponents=EXPONENTS, kind=np.zeros(2, dtype=np.intp), pooled=4.0
+            )
+        )  # fmt: skip
+        for g in range(2):
+            some = np.flatnonzero(g == GROUP)
+            u = np.sqrt(np.einsum("ij,jk,ik->i", P, found.covariance[np.ix_(some, some)], P))
+            held.append(np.mean(np.abs(P @ (found.value - x)[some]) <= 1.96 * u))
+    assert np.mean(held) > 0.9
+
+
 def test_the_average_has_the_moments_of_draws_from_all_exponents():
     A, _, y = readings(np.random.default_rng(8), (1.0, 0.2), 2.0, count=25)
     parts = posteriors(*normal(A, y), GROUP, ORDER, exponents=(1.5, 2.0, 2.5))
@@ -85,15 +126,15 @@ def test_the_average_has_the_moments_of_draws_from_all_exponents():
     rng, draws = np.random.default_rng(9), 40_000
     which = rng.choice(3, draws, p=found.weight)
     z = rng.normal(size=(draws, len(ORDER)))
-    x = np.array([each.value for each in parts])[which] + np.einsum(
-        "dij,di->dj", np.array([each.half for each in parts])[which], z
-    )
+    half = np.array([np.linalg.cholesky(each.covariance + each.of_sizes).T for each in parts])
+    x = np.array([each.value for each in parts])[which] + np.einsum("dij,di->dj", half[which], z)
     u = np.sqrt(np.diag(found.covariance))
     assert x.mean(axis=0) == pytest.approx(found.value, abs=5 * u.max() / np.sqrt(draws))
     # a variance of draws from nearly normal distributions has the relative standard deviation sqrt(2 / draws)
     assert x.std(axis=0) == pytest.approx(u, rel=5 * np.sqrt(1 / (2 * draws)))
     expected = sum(
-        w * each.size[1] ** 2 * 5.0 ** (-2 * each.exponent) for w, each in zip(found.weight, parts, strict=True)
+        w * each.size[1] ** 2 * (1 + 4 * each.u_size[1] ** 2) * 5.0 ** (-2 * each.exponent)
+        for w, each in zip(found.weight, parts, strict=True)
     )
     assert found.variance([4, 5])[1, 1] == pytest.approx(expected)
 

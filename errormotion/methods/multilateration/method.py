@@ -26,7 +26,7 @@ class Multilateration(ModelMethod):
         id="multilateration",
         summary="Volumetric error and the errors of three axes from tracker distances, stations and dead paths unknown",
         status="simulated_only",
-        version="5",
+        version="6",
         cannot_see=(
             "the six rigid motions of the whole: position and orientation of the machine's coordinates are fitted",
             "rotations of the tool at a target: a reflector is a point",

@@ -26,7 +26,7 @@ class SpindleDrift(ModelMethod):
         id="spindle_drift",
         summary="Spindle drift with five sensors on a bar, ISO 230-3: beam detection and drift",
         status="simulated_only",
-        version="5",
+        version="6",
         cannot_see=(
             "the rotation about the spindle axis (EC)",
             "errors within one turn of the spindle, which are averaged out",

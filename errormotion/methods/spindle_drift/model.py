@@ -280,10 +280,10 @@ def observe(raw: xr.Dataset, settings: SpindleDriftSettings) -> Observed:
             reference=Block(start=state[-1:], index=np.zeros_like(index), scale=scale, group=REFERENCE),
         ),
         constants=constants,
-        noise=Noise(sd=_noise(sigma, beyond, reference, own)),
+        noise=Noise(sd=_noise(sigma, beyond.sd, reference, own)),
     )
     shown = np.where(known[:-1] & ~coming_up, 0.0, np.nan)[:, None]
-    result = Result(raw, record, setup, settings, reference, state, point, UNSEEN)
+    result = Result(raw, record, setup, settings, reference, state, point, UNSEEN, beyond)
     return Observed(
         problem=problem,
         places=Places(

@@ -12,7 +12,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.estimation.sources import Source
 from errormotion.methods.spindle_drift.identification import iso230_3
-from errormotion.methods.spindle_drift.identification.bar import axis_direction
+from errormotion.methods.spindle_drift.identification.bar import axis_direction, errors_of, states
 from errormotion.methods.spindle_drift.identification.record import length_of_means, sensors
 from errormotion.methods.spindle_drift.schema import CHANNELS
 from errormotion.methods.spindle_drift.settings import TrialSettings
@@ -20,6 +20,7 @@ from errormotion.methods.spindle_drift.settings import TrialSettings
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from errormotion.estimation.checks.slow_noise import SlowNoise
     from errormotion.estimation.sources import Errors
     from errormotion.measurement.observed import Solved
     from errormotion.methods.spindle_drift.identification.record import Record
@@ -34,7 +35,8 @@ REFERENCE = "reference state"
 class Result:
     """A drift record, its reference state (instants), the states (n + 1, 5) of instants and reference, and the point.
 
-    ``off_axis`` is the group of the sources without effect on the axis of the spindle.
+    ``off_axis`` is the group of the sources without effect on the axis of the spindle, ``slow`` the noise of the five
+    readings that may be alike at neighbouring instants.
     """
 
     raw: xr.Dataset
@@ -45,6 +47,7 @@ class Result:
     state: Array
     point: Array
     off_axis: str
+    slow: SlowNoise
 
     @property
     def zero(self) -> float:
@@ -139,7 +142,9 @@ class Result:
         influence = errors.influence[self._on_axis(errors)]
         E0, point = self.state[-1, :3], self.point
         return iso230_3.evaluate(
-            iso230_3.quantities(errors.value, errors.own, influence, self.setup.levels - point[2], E0 - point),
+            iso230_3.quantities(
+                errors.value, errors.own, influence, self.setup.levels - point[2], E0 - point, self._alike()
+            ),
             self.time,
             temperature=record.temperature,
             sensors=sensors(self.raw) if record.temperature is not None else (),
@@ -151,6 +156,25 @@ class Result:
             mean=length_of_means(record.averages, settings),
             changes=[event.at - self.zero for event in settings.schedule if event.compensation],
         )
+
+    def _alike(self) -> tuple[Array, Array, float] | None:
+        """Return the effects (channel, n, 5) of the noise that is alike on the errors, its times and its duration."""
+        if not self.slow.duration > 0:
+            return None
+        effects = np.zeros((len(CHANNELS), self.time.size, 5))
+        for k in np.flatnonzero(self.slow.sd > 0):
+            change = np.zeros((len(CHANNELS), 1))
+            change[k] = self.slow.sd[k]
+            above, below = (self._errors(self.record.averages.mean + each) for each in (change, -change))
+            effects[k] = (above - below) / 2.0
+        effects[:, self.reference] *= np.sqrt(1.0 - 1.0 / self.reference.size)  # as in `finish`
+        return effects, self.time, self.slow.duration
+
+    def _errors(self, readings: Array) -> Array:
+        """Return EX EY EZ EA EB (n, 5) for readings (5, n), without the expansion of the frame."""
+        setup = self.setup
+        its = states(readings, setup.origin, setup.direction, setup.radius, setup.levels)
+        return errors_of(its, self.state[-1:], self.point)
 
     def _extras(self, residual: Array) -> dict[str, xr.DataArray]:
         def over_channel(values: Array, unit: str) -> xr.DataArray:

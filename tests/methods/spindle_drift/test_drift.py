@@ -149,6 +149,15 @@ def test_more_noise_than_stated_is_reported_and_increases_the_uncertainty(machin
     assert not any("stated noise" in note for note in honest.attrs["notes"])
 
 
+def test_less_noise_than_stated_is_reported(machine, method):
+    raw = simulation.raw_drift(machine, np.arange(0, 200, 0.5), seed=6)
+    plain = method.identify(raw)
+    raw["distance_noise"] = 3 * raw["distance_noise"]
+    notes = [note for note in method.identify(raw).attrs["notes"] if "follows from the stated noise" in note]
+    assert [note[:2] for note in notes] == ["X1", "X2", "Y1", "Y2", "Z:"]
+    assert not any("stated noise" in note for note in plain.attrs["notes"])
+
+
 def test_an_uncertainty_of_the_radius_that_is_not_stated_is_noted(machine, method):
     raw = simulation.raw_drift(machine, TIMES, seed=0)
     assumed, stated = method.identify(raw), method.identify(raw, SpindleDriftSettings(bar_radius_uncertainty="1 um"))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import signal, stats
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_drift.identification.iso230_3 import MEASURES, QUANTITIES, evaluate, quantities
@@ -102,6 +102,34 @@ def test_ranges_lie_within_their_uncertainty_at_rest_and_moving(size):
                 found, name, "range_60min", "uncertainty"
             )
     assert min(held.values()) >= stats.binom.ppf(1e-3, seeds, 0.95), held
+
+
+@pytest.mark.slow
+def test_means_and_slopes_of_noise_that_is_alike_lie_within_their_uncertainty():
+    t = np.arange(0, 4000.0, 10.0)
+    phi, size, seeds = 0.9, 2 * U, 40  # alike for 95 s, beside the independent noise U
+    effect = size * np.tile(np.eye(5)[:, None], (1, t.size, 1))
+    none = np.zeros((1, t.size, 6))
+    independent = np.tile((U**2 + size**2) * np.eye(6), (t.size, 1, 1))
+    warmth = np.stack([20.0 + 1e-3 * t])
+    options = {"temperature": warmth, "sensors": ("front",), "spindle_speed": None, "running_end": None, "sensor": None}
+    held = {measure: [] for measure in ("range_60min", "difference_60min", "end_slope", "per_kelvin")}
+    true = results(t, temperature=warmth, sensors=("front",))
+    for seed in range(seeds):
+        draw = np.random.default_rng(seed).standard_normal
+        e = signal.lfilter([1.0], [1.0, -phi], np.sqrt(1 - phi**2) * draw((t.size + 500, 5)), axis=0)[500:]
+        errors = drift(t)
+        errors[:, :5] += size * e + U * draw((t.size, 5))
+        series = quantities(
+            errors, independent, none, np.array([0.01, 0.05]), np.zeros(3), (effect, t, -10.0 / np.log(phi))
+        )
+        found = evaluate(series, t, average=30.0, reference=np.array([0]), **options)
+        for measure, inside in held.items():
+            for quantity in ("Z", "A", "B"):  # independent of one another
+                off = value(found, quantity, measure) - value(true, quantity, measure)
+                inside.append(abs(off) <= 2 * value(found, quantity, measure, "uncertainty"))
+    for measure, inside in held.items():
+        assert np.sum(inside) >= stats.binom.ppf(1e-3, len(inside), 0.95), (measure, np.mean(inside))
 
 
 def test_the_bias_of_a_range_at_rest_is_its_value():

@@ -45,31 +45,91 @@ LABELS = {"level": ["L1", "L2"], "lateral": ["x", "y"], "quantity": list(QUANTIT
 HOUR = 3600.0
 _SLOPE_SPAN = 600.0
 """Interval before the end of running over which the end slope is taken, s."""
+_BLOCK = 256
+"""Instants whose correlations are in memory at a time."""
 _MIN_CHANGE = 0.2
 """Smallest change of temperature for a value per kelvin, K."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """Seven quantities over time: value (7, t), influence (source, 7, t) and independent variance (7, t)."""
+    """Seven quantities over time.
+
+    Attributes
+    ----------
+    value : ndarray, (7, t)
+    influence : ndarray, (source, 7, t)
+    variance : ndarray, (7, t)
+        Of what is no source, at one instant.
+    alike : Alike, optional
+        The part of it that neighbouring instants have in common; the rest is independent.
+    """
 
     value: Array
     influence: Array
     variance: Array
+    alike: Alike | None = None
 
     def weighted(self, k: int, index: Index, weights: Array) -> tuple[float, float, Array]:
         """Return value, standard uncertainty and influence (source,) of a weighted sum of quantity k over instants."""
         shared = self.influence[:, k, index] @ weights
-        own = self.variance[k, index] @ weights**2
+        own = self.own(k, index, weights)
         return float(self.value[k, index] @ weights), float(np.sqrt(shared @ shared + own)), shared
 
+    def own(self, k: int, index: Index, weights: Array) -> float:
+        """Return the variance of a weighted sum of quantity k over instants, without that by the sources."""
+        found = float(self.variance[k, index] @ weights**2)
+        # not less than for independent instants: the correlation is estimated
+        return found + (max(self.alike.common(k, index, weights), 0.0) if self.alike is not None else 0.0)
 
-def quantities(errors: Array, independent: Array, influence: Array, heights: Array, arm: Array) -> Series:
+
+@dataclass(frozen=True)
+class Alike:
+    """Noise of the readings that is alike at neighbouring instants, with the correlation ``exp(-d / duration)``.
+
+    Attributes
+    ----------
+    effect : ndarray, (channel, 7, t)
+        Of one standard deviation of it, which is independent between channels.
+    time : ndarray, (t,)
+        s.
+    duration : float
+        s.
+    """
+
+    effect: Array
+    time: Array
+    duration: float
+
+    def common(self, k: int, index: Index, weights: Array) -> float:
+        """Return what the correlation adds to the variance of a weighted sum of quantity k over instants."""
+        order = np.argsort(self.time[index], kind="stable")
+        time, effect = self.time[index][order], (self.effect[:, k, index] * weights)[:, order]
+        total, before, last = 0.0, np.zeros(len(effect)), time[0]
+        for first in range(0, time.size, _BLOCK):
+            t, x = time[first : first + _BLOCK], effect[:, first : first + _BLOCK]
+            # sum over i < j of x_i exp(-(t_j - t_i) / duration) x_j: within the block, and with all before it
+            R = np.tril(np.exp(-np.abs(np.subtract.outer(t, t)) / self.duration), -1)
+            since = np.exp(-(t - last) / self.duration)
+            total += float(np.einsum("cj,ji,ci->", x, R, x, optimize=True)) + float(before @ x @ since)
+            before, last = before * since[-1] + x @ np.exp(-(t[-1] - t) / self.duration), t[-1]
+        return 2.0 * total
+
+
+def quantities(
+    errors: Array,
+    independent: Array,
+    influence: Array,
+    heights: Array,
+    arm: Array,
+    alike: tuple[Array, Array, float] | None = None,
+) -> Series:
     """Return the seven quantities of error twists (t, 6), all on the spindle's axis.
 
     ``heights`` (2,) are those of L1 and L2 above the functional point, ``arm`` (3,) is the vector from it to the end of
     the bar on its axis, m. The unknown rotation about the axis has no effect on the axis; its source is not in
-    ``influence``.
+    ``influence``. ``alike`` are the effects (channel, t, 5) of noise that is alike at neighbouring instants, the times
+    (t,) and the duration of `Alike`.
     """
     G = np.zeros((7, 5))
     for level, z in enumerate(heights):
@@ -81,6 +141,7 @@ def quantities(errors: Array, independent: Array, influence: Array, heights: Arr
         G @ errors[:, :5].T,
         np.einsum("ki,sti->skt", G, influence[..., :5]),
         np.einsum("ki,tij,kj->kt", G, independent[:, :5, :5], G),
+        None if alike is None else Alike(np.einsum("ki,cti->ckt", G, alike[0]), *alike[1:]),
     )
 
 
@@ -231,7 +292,7 @@ def _range(series: Series, k: int, parts: list[Weighted], reference: Index) -> t
     shared = np.empty((len(series.influence), len(parts)))
     for i, part in enumerate(parts):
         value[i] = series.value[k, part.index] @ part.weights
-        variance[i] = series.variance[k, part.index] @ part.weights**2
+        variance[i] = series.own(k, part.index, part.weights)
         shared[:, i] = series.influence[:, k, part.index] @ part.weights
     extremes = range_from_reference(value, variance, shared)
     every = [Weighted(reference, np.full(reference.size, 1.0 / reference.size)), *parts]

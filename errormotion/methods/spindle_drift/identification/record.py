@@ -24,7 +24,7 @@ from errormotion.estimation.checks import resolution
 from errormotion.estimation.checks.aliases import aliases
 from errormotion.estimation.checks.resolution import step_of
 from errormotion.estimation.checks.series import spikes
-from errormotion.estimation.checks.slow_noise import sentence, slow_noise
+from errormotion.estimation.checks.slow_noise import SlowNoise, sentence, slow_noise
 from errormotion.methods.spindle_drift.identification.averaging import (
     Averager,
     Averages,
@@ -347,30 +347,36 @@ def noise(raw: xr.Dataset, record: Record, settings: SpindleDriftSettings, notes
             continue
         seen = float(np.median(np.abs(second)) / 0.674490)
         # Standard deviation of this estimate from overlapping second differences, by simulation: 1.7 / sqrt(2 n).
-        if seen > stated * (1.0 + _CHANCE * 1.7 / np.sqrt(2 * second.size)):
-            notes.append(
-                f"{channel}: the noise observed in the means is {seen * 1e6:.3g} um per sample, the stated noise is "
-                f"{stated * 1e6:.3g} um; the uncertainty follows from the observed noise."
-            )
+        chance = _CHANCE * 1.7 / np.sqrt(2 * second.size)
+        said = (
+            f"{channel}: the noise observed in the means is {seen * 1e6:.3g} um per sample, the stated noise is "
+            f"{stated * 1e6:.3g} um; the uncertainty follows from the"
+        )
+        if seen > stated * (1.0 + chance):
+            notes.append(f"{said} observed noise.")
             sigma[i] = seen / root
+        elif seen < stated * (1.0 - chance) and record.step[i] < stated and raw.attrs.get("machine") != PLANNED:
+            notes.append(f"{said} stated noise.")
     return _rounded(np.asarray(sigma * record.weight), record, notes)
 
 
-def slow(record: Record, sigma: Array, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]) -> Array:
-    """Return the standard deviation (5,) of the noise of the means beyond ``sigma`` (5, instant), m, if there is any.
+def slow(record: Record, sigma: Array, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]) -> SlowNoise:
+    """Return the noise of the means (5,) beyond ``sigma`` (5, instant), m, if there is any.
 
     It is alike from mean to mean, or the readings are too few for their second differences.
     """
-    averages = record.averages
+    averages, none = record.averages, SlowNoise(np.zeros(len(CHANNELS)), 0.0)
     if settings.noise == "stated":
-        return np.zeros(len(CHANNELS))
+        return none
     values = np.where(settling(record, settings.spin_up), np.nan, averages.mean)
     noise_part = slow_noise(averages.time, values, sigma, _abrupt(record, settings))
     if noise_part is None:
-        return np.zeros(len(CHANNELS))
+        return none
     sizes = ", ".join(f"{name} {sd * 1e6:.2g} um" for name, sd in zip(CHANNELS, noise_part.sd, strict=True) if sd > 0)
     (doubts if noise_part.duration > 0 else notes).append(sentence(noise_part, sizes))
-    return noise_part.sd
+    if noise_part.duration > 0:
+        notes.append("The uncertainties of the values of ISO 230-3 contain that these readings are alike.")
+    return noise_part
 
 
 def run_out_left(
