@@ -70,8 +70,6 @@ class Posterior:
     size : ndarray, (group,)
         Standard deviation tau of a coefficient of order 1, as estimated from these coefficients; at convergence that of
         their prior.
-    u_size : ndarray, (group,)
-        Standard uncertainty of its logarithm.
     exponent : float
         p of the priors ``tau n^-p``.
     evidence : float
@@ -83,7 +81,6 @@ class Posterior:
     of_sizes: Array
     determined: Array
     size: Array
-    u_size: Array
     exponent: float
     evidence: float
 
@@ -126,8 +123,7 @@ class Averaged:
     def variance(self, order: ArrayLike) -> Array:
         """Return the mean prior variances (group, order) of coefficients of orders (order,)."""
         n = np.asarray(order, dtype=float)
-        # E tau^2 to the second order, as in the covariance
-        each = [np.outer(part.size**2 * (1 + 4 * part.u_size**2), n ** (-2 * part.exponent)) for part in self.parts]
+        each = [np.outer(part.size**2, n ** (-2 * part.exponent)) for part in self.parts]
         return np.asarray(np.einsum("p,pgn->gn", self.weight, each))
 
 
@@ -261,20 +257,18 @@ class _Search:
                 break
         evidence = float(self.b @ x) - log_det + float(np.log(prior[self.members]).sum())
         determined = 1 - variance * prior
-        of_sizes, u_size = self._of_sizes(x, half, prior)
         return Posterior(
             value=x * self.unit,
             half=half * self.unit,
-            of_sizes=of_sizes * np.outer(self.unit, self.unit),
+            of_sizes=self._of_sizes(x, half, prior) * np.outer(self.unit, self.unit),
             determined=determined,
             size=tau,
-            u_size=u_size,
             exponent=exponent,
             evidence=evidence,
         )
 
-    def _of_sizes(self, x: Array, half: Array, prior: Array) -> tuple[Array, Array]:
-        """Return what the uncertainty of the sizes adds to the covariance, and that of their logarithms."""
+    def _of_sizes(self, x: Array, half: Array, prior: Array) -> Array:
+        """Return what the uncertainty of the sizes adds to the covariance."""
         root = np.sqrt(prior[self.members])
         B = (half.T @ half[:, self.members]) * root  # C P^1/2
         Y, u = root[:, None] * B[self.members], root * x[self.members]
@@ -286,7 +280,7 @@ class _Search:
         values, vectors = np.linalg.eigh((A + A.T) / 2)
         S = (vectors / np.maximum(values, _LARGEST_U**-2)) @ vectors.T
         each = S[np.ix_(self.group, self.group)]
-        return B @ (4 * each * (Y + np.outer(u, u))) @ B.T, np.sqrt(np.diag(S))
+        return np.asarray(B @ (4 * each * (Y + np.outer(u, u))) @ B.T)
 
 
 def _half_of_inverse(N: Array, prior: Array, rounding: float) -> tuple[Array, float]:

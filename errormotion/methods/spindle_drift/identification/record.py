@@ -360,7 +360,9 @@ def noise(raw: xr.Dataset, record: Record, settings: SpindleDriftSettings, notes
     return _rounded(np.asarray(sigma * record.weight), record, notes)
 
 
-def slow(record: Record, sigma: Array, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]) -> SlowNoise:
+def slow(
+    record: Record, sigma: Array, settings: SpindleDriftSettings, notes: list[str], doubts: list[str]
+) -> SlowNoise:
     """Return the noise of the means (5,) beyond ``sigma`` (5, instant), m, if there is any.
 
     It is alike from mean to mean, or the readings are too few for their second differences.
