@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 
 def filled(values: Array) -> Array:
     """Return a copy with 0 for NaN."""
-    found: Array = np.where(np.isnan(values), 0.0, values)
-    return found
+    values_filled: Array = np.where(np.isnan(values), 0.0, values)
+    return values_filled
 
 
 def products(influence: Array) -> Array:
@@ -22,5 +22,5 @@ def products(influence: Array) -> Array:
     """
     rows = np.array(np.moveaxis(influence, 0, -1), order="C")  # contiguous, for BLAS
     rows[np.isnan(rows)] = 0.0
-    found: Array = np.matmul(rows, np.swapaxes(rows, -1, -2))
-    return found
+    result: Array = np.matmul(rows, np.swapaxes(rows, -1, -2))
+    return result

@@ -46,9 +46,9 @@ class ErrormotionError(Exception):
 
     def restated(self, message: str) -> Self:
         """Return the same error, with its code and its other attributes, with another message."""
-        found = type(self).__new__(type(self), message)
-        found.__dict__.update(self.__dict__)
-        return found
+        error = type(self).__new__(type(self), message)
+        error.__dict__.update(self.__dict__)
+        return error
 
 
 class InstrumentError(ErrormotionError):

@@ -37,17 +37,17 @@ def own_folder(*names: str) -> Path:
     return folder.joinpath(*names)
 
 
-def is_private(found: os.stat_result) -> bool:
+def is_private(status: os.stat_result) -> bool:
     """Return whether a file belongs to this user and no other user has rights to it; true on systems without modes."""
-    return not hasattr(os, "geteuid") or (found.st_uid == os.geteuid() and not found.st_mode & 0o077)
+    return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o077)
 
 
 def close_to_others(path: Path) -> None:
     """Remove all rights of other users to a file or folder of this user; a link is not followed."""
     with suppress(OSError):
-        found = path.lstat()
-        if not stat.S_ISLNK(found.st_mode) and not is_private(found) and found.st_uid == os.geteuid():
-            path.chmod(stat.S_IMODE(found.st_mode) & ~0o077)
+        status = path.lstat()
+        if not stat.S_ISLNK(status.st_mode) and not is_private(status) and status.st_uid == os.geteuid():
+            path.chmod(stat.S_IMODE(status.st_mode) & ~0o077)
 
 
 def open_itself(path: str | os.PathLike[str], flags: int, mode: int = 0o600) -> int:

@@ -139,8 +139,8 @@ def identify_runs(
     if note:
         log.warning("%s", note)
     method = plugins.get("methods", method_id)
-    found = list(_selected([Path(raw) for raw in raws], method_id))
-    wanted = [raw for raw, reason in found if not reason]
+    selected = list(_selected([Path(raw) for raw in raws], method_id))
+    wanted = [raw for raw, reason in selected if not reason]
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -153,7 +153,7 @@ def identify_runs(
         Task(str(raw_of(raw).resolve()), str(out.resolve() / f"{name}.nc"), *common)
         for raw, name in zip(wanted, _names(wanted), strict=True)
     ]
-    outcomes = {raw: Outcome(raw, reason=reason) for raw, reason in found if reason}
+    outcomes = {raw: Outcome(raw, reason=reason) for raw, reason in selected if reason}
     paths = {task.raw: raw for task, raw in zip(tasks, wanted, strict=True)}
     progress = progress or Quiet()
 
@@ -168,12 +168,12 @@ def identify_runs(
         if failed := sum(bool(other.reason) for other in outcomes.values()):
             progress.note(f"{failed} failed")
 
-    progress.stage("identifying", len(found))
+    progress.stage("identifying", len(selected))
     try:
         _work(tasks, name, workers, done)
     except KeyboardInterrupt as error:
-        raise KeyboardInterrupt(f"{len(outcomes)} of {len(found)} runs are done; repeat the command") from error
-    return [outcomes[raw] for raw, _ in found]
+        raise KeyboardInterrupt(f"{len(outcomes)} of {len(selected)} runs are done; repeat the command") from error
+    return [outcomes[raw] for raw, _ in selected]
 
 
 def choose_scheduler(wanted: str | None) -> tuple[str, str]:
@@ -216,27 +216,27 @@ def _selected(raws: Sequence[Path], method_id: str) -> Iterator[tuple[Path, str]
 
 def _runs(folder: Path, method_id: str) -> list[tuple[Path, str]]:
     """Return the runs of a method in a folder, with the reason for those that cannot be identified."""
-    found: list[tuple[Path, str]] = []
+    runs: list[tuple[Path, str]] = []
     others: set[str] = set()
     for path in [file.parent for file in visible(folder, "*/run.json")]:
         try:
             data = RunFolder.open(path).data
         except RunError as error:
-            found.append((path, str(error)))
+            runs.append((path, str(error)))
             continue
         if (other := data["method"]["id"]) != method_id:
             others.add(str(other))
         elif data["acquired"]:
-            found.append((path, ""))
+            runs.append((path, ""))
         else:
             resume = f"continue it with 'errormotion run --resume --runs {folder}'"
-            found.append((path, f"{path}: the measurement is not complete ({data['status']}); {resume}"))
-    if not found:
+            runs.append((path, f"{path}: the measurement is not complete ({data['status']}); {resume}"))
+    if not runs:
         raise RunError(
             f"{folder}: expected runs of the method '{method_id}'; found {', '.join(sorted(others))}",
             code="batch.method.other",
         )
-    return found
+    return runs
 
 
 def _names(raws: Sequence[Path]) -> list[str]:

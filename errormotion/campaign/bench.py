@@ -182,12 +182,12 @@ class OpenBench:
 
     def chosen(self, choice: Mapping[str, str]) -> OpenBench:
         """Return the open bench with one instrument for each kind in ``choice`` (kind to name), and all others."""
-        found = copy(self)
+        bench = copy(self)
         kinds = [(answer, answer.instrument.driver.info.kind) for answer in self.answers]
-        found.answers = [
+        bench.answers = [
             answer for answer, kind in kinds if choice.get(kind, answer.instrument.name) == answer.instrument.name
         ]
-        return found
+        return bench
 
     def has_kind(self, kind: str) -> bool:
         """Return whether the bench has an instrument of this kind."""
@@ -201,14 +201,14 @@ class OpenBench:
         BenchError
             The bench has none, or several.
         """
-        found = [answer for answer in self.answers if answer.instrument.driver.info.kind == kind]
-        if len(found) == 1:
-            return found[0].driver
-        if found:
-            names = ", ".join(answer.instrument.name for answer in found)
+        answers = [answer for answer in self.answers if answer.instrument.driver.info.kind == kind]
+        if len(answers) == 1:
+            return answers[0].driver
+        if answers:
+            names = ", ".join(answer.instrument.name for answer in answers)
             raise BenchError(
                 f"Bench '{self.plan.name}': expected one {kind}; found {names}. Choose one in the test: "
-                f'instruments = {{ {kind} = "{found[0].instrument.name}" }}.',
+                f'instruments = {{ {kind} = "{answers[0].instrument.name}" }}.',
                 code="bench.instruments.several",
             )
         raise BenchError(

@@ -122,10 +122,10 @@ def uses(plan: BenchPlan, role: Role = "measure", *, only: str = "", offsets: bo
     offsets : bool
         Whether offsets are written to the compensator of the bench.
     """
-    found = [_use(plan.machine, each, role) for each in plan.instruments if only in ("", each.name)]
+    used = [_use(plan.machine, each, role) for each in plan.instruments if only in ("", each.name)]
     if offsets and plan.compensator is not None:
-        found.append(_use(plan.machine, plan.compensator, "offset"))
-    return tuple(each for part in found for each in part)
+        used.append(_use(plan.machine, plan.compensator, "offset"))
+    return tuple(each for part in used for each in part)
 
 
 def use_of(url: str) -> Use:
@@ -171,8 +171,8 @@ def holder(wanted: Iterable[Use]) -> Claim | None:
     keys, folder = {each.key for each in wanted}, _folder()[0]
     if folder is None:
         return None
-    found = [(time_ns, claim) for time_ns, claim, theirs in _locked(folder, "claim") if keys & theirs.keys()]
-    return max(found, key=lambda each: each[0])[1] if found else None
+    holders = [(time_ns, claim) for time_ns, claim, theirs in _locked(folder, "claim") if keys & theirs.keys()]
+    return max(holders, key=lambda each: each[0])[1] if holders else None
 
 
 @contextmanager
@@ -282,12 +282,12 @@ def _wait(folder: Path, wanted: tuple[Use, ...]) -> None:
 
 def _locked(folder: Path, ending: str) -> list[tuple[int, Claim, Mapping[str, str]]]:
     """Return time (ns), claim, and hashes with their roles, of each program that is alive."""
-    found = []
+    locked = []
     for _, descriptor in _files(folder, f".{ending}"):
         state = os.fstat(descriptor)
         if stat.S_ISREG(state.st_mode) and not _free(descriptor):
-            found.append((state.st_mtime_ns, *_read(descriptor, state.st_uid)))
-    return found
+            locked.append((state.st_mtime_ns, *_read(descriptor, state.st_uid)))
+    return locked
 
 
 def _remove_ended(folder: Path) -> None:
@@ -375,10 +375,10 @@ def _folder() -> tuple[Path | None, str]:
 def _can_lock(place: str) -> bool:
     """Return whether files of a folder can be locked; some file systems refuse it."""
     try:
-        found = os.stat(place)
+        status = os.stat(place)
     except OSError:
         return False
-    return _locks(place, found.st_dev, found.st_ino)
+    return _locks(place, status.st_dev, status.st_ino)
 
 
 @cache
@@ -407,16 +407,16 @@ def _is_shared(place: str) -> bool:
         finally:
             os.umask(mask)
     try:
-        found = os.lstat(place)
+        status = os.lstat(place)
     except OSError:
         return False
-    right = stat.S_ISDIR(found.st_mode) and stat.S_IMODE(found.st_mode) & SHARED == SHARED
+    right = stat.S_ISDIR(status.st_mode) and stat.S_IMODE(status.st_mode) & SHARED == SHARED
     return right and os.access(place, os.W_OK | os.X_OK)
 
 
 def _use(machine: str, device: BenchInstrument | BenchCompensator, role: Role) -> list[Use]:
     name = device.name if isinstance(device, BenchInstrument) else "the offset output"
-    found = []
+    keys = []
     for url in urls(device):
         same, own = same_device(url), role
         if scheme_of(url) in EXEMPT or not same:  # of this process, or of this user
@@ -424,8 +424,8 @@ def _use(machine: str, device: BenchInstrument | BenchCompensator, role: Role) -
             own = "show" if url else role
         elif is_line(url):
             own = "measure"
-        found.append(Use(_hash(same), own, f"{name} ({url})" if url else name))
-    return found
+        keys.append(Use(_hash(same), own, f"{name} ({url})" if url else name))
+    return keys
 
 
 def _hash(text: str) -> str:

@@ -34,12 +34,12 @@ from errormotion.tolerances.table import Tolerances
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
 
 
-def _certificates(found: dict[str, str]) -> dict[str, str]:
-    if mistakes := certificates.wrong(found):
+def _certificates(stated: dict[str, str]) -> dict[str, str]:
+    if mistakes := certificates.wrong(stated):
         raise ValueError(
             f"{mistakes[0]}: expected the number or hash of a certificate for one of {', '.join(certificates.ITEMS)}"
         )
-    return found
+    return stated
 
 
 Certificates = Annotated[
@@ -305,10 +305,10 @@ _KINDS = {
 
 def _refuse_other(path: Path, data: Mapping[str, Any], expected: str) -> None:
     """Raise BenchError for a file of another kind; otherwise all its keys would be reported as unknown."""
-    found = str(data.get("schema", "")).removeprefix("errormotion.").partition("/")[0]
-    if found != expected and found in _KINDS:
+    kind = str(data.get("schema", "")).removeprefix("errormotion.").partition("/")[0]
+    if kind != expected and kind in _KINDS:
         raise BenchError(
-            f"{path}: expected a {expected} file; found a file of kind '{found}'. {_KINDS[found]}",
+            f"{path}: expected a {expected} file; found a file of kind '{kind}'. {_KINDS[kind]}",
             code="bench.file.kind",
         )
 
@@ -317,8 +317,8 @@ def _missing(campaign: CampaignPlan) -> Iterator[str]:
     """Yield the errors that methods find in their settings, such as missing files."""
     for number, test in enumerate(campaign.tests):
         with looking_beside(campaign.folder):
-            found = test.method().check(test.settings)
-        yield from (f"{tomlfile.dotted(('test', number, 'settings', key))}: {text}" for key, text in found.items())
+            missing = test.method().check(test.settings)
+        yield from (f"{tomlfile.dotted(('test', number, 'settings', key))}: {text}" for key, text in missing.items())
 
 
 def parse_bench(text: str, source: Path) -> BenchPlan:
@@ -329,26 +329,26 @@ def parse_bench(text: str, source: Path) -> BenchPlan:
         description, mistakes = read_machine(machine)
         data["machine"] = str(machine.get("name"))
     if "limits" in data:
-        data["limits"], found = without_limits(data["limits"])
-        mistakes += found
-    table, found = tomlfile.check(data, BenchTable)
-    mistakes += found
+        data["limits"], mistakes_of_part = without_limits(data["limits"])
+        mistakes += mistakes_of_part
+    table, mistakes_of_part = tomlfile.check(data, BenchTable)
+    mistakes += mistakes_of_part
     limits = table.limits if table else Limits()
     if description is not None:
-        limits, found = limits_within(limits, description)
-        mistakes += found
+        limits, mistakes_of_part = limits_within(limits, description)
+        mistakes += mistakes_of_part
     instruments = []
     for name, entry in _tables(data.get("instruments")):
         if not isinstance(entry.get("driver"), str):
             continue
         own = {key: value for key, value in entry.items() if key not in InstrumentTable.model_fields}
-        settings, found = _settings("instruments", entry["driver"], own, ("instruments", name))
-        mistakes += [*found, *_address_mistakes(entry, ("instruments", name))]
+        settings, mistakes_of_part = _settings("instruments", entry["driver"], own, ("instruments", name))
+        mistakes += [*mistakes_of_part, *_address_mistakes(entry, ("instruments", name))]
         if settings is not None:
             driver = plugins.get("instruments", entry["driver"])
             instruments.append(BenchInstrument(str(name), driver, entry.get("address", ""), settings))
-    compensator, found = _compensator(data.get("compensator"), table)
-    mistakes += found
+    compensator, mistakes_of_part = _compensator(data.get("compensator"), table)
+    mistakes += mistakes_of_part
     mistakes += head.until_mistakes(table.calibrated_until, table.instruments) if table else []
     if table is None or mistakes:
         raise MistakesError(source, mistakes)
@@ -455,13 +455,15 @@ def _tables(value: Any) -> list[tuple[str | int, dict[str, Any]]]:
 
 def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], bench: BenchPlan | None) -> list[str]:
     settings = entry.get("settings", {})
-    found, mistakes = _settings("methods", entry["method"], settings if isinstance(settings, dict) else {}, place)
+    settings_of_method, mistakes = _settings(
+        "methods", entry["method"], settings if isinstance(settings, dict) else {}, place
+    )
     if bench is not None and entry.get("instruments"):
         wrong = _choice_mistakes(entry["instruments"], (*place, "instruments"), bench)
         if wrong is None or wrong:
             return mistakes + (wrong or [])
         bench = bench.chosen(entry["instruments"])
-    if found is not None and bench is not None:
+    if settings_of_method is not None and bench is not None:
         lacking = [
             kind for kind in plugins.get("methods", entry["method"]).needs.instruments if kind not in bench.kinds
         ]
@@ -478,11 +480,11 @@ def _method_mistakes(entry: Mapping[str, Any], place: tuple[str | int, ...], ben
                     f'{bench.source} has {", ".join(names)}. Choose one: instruments = {{ {kind} = "{names[0]}" }}'
                 )
         method = plugins.get("methods", entry["method"])
-        found = completed(method, found, bench.description)
-        for key, text in contradictions(method, found, bench.description).items():
+        settings_of_method = completed(method, settings_of_method, bench.description)
+        for key, text in contradictions(method, settings_of_method, bench.description).items():
             where = tomlfile.dotted((*place, "settings", *([key] if key else [])))
             mistakes.append(f"{where}: {text} ([machine] of {bench.source})")
-        mistakes += _limit_mistakes(entry["method"], found, bench, place)
+        mistakes += _limit_mistakes(entry["method"], settings_of_method, bench, place)
     return mistakes
 
 

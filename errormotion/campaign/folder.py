@@ -333,16 +333,16 @@ def is_locked(path: Path) -> bool:
 
 def list_runs(runs: Path, skipped: list[str] | None = None) -> list[RunFolder]:
     """Return the run folders in a folder, the oldest first; unreadable ones are logged, and appended to ``skipped``."""
-    found = []
+    folders = []
     for path in sorted(runs.iterdir()) if runs.is_dir() else []:
         if path.is_dir() and not path.name.startswith(".") and os.path.lexists(path / "run.json"):
             try:
-                found.append(RunFolder.open(path))
+                folders.append(RunFolder.open(path))
             except RunError as error:
                 log.warning("skipped: %s", error)
                 if skipped is not None:
                     skipped.append(str(error))
-    return sorted(found, key=lambda folder: str(folder.data.get("created", "")))
+    return sorted(folders, key=lambda folder: str(folder.data.get("created", "")))
 
 
 def now() -> str:

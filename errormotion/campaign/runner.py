@@ -236,7 +236,7 @@ def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests:
         The test of a run folder is unclear, and would be measured again.
     """
     by_path = {folder.path: folder for folder in known}
-    found: dict[str, RunFolder] = {}
+    folders: dict[str, RunFolder] = {}
     unclear = []
     for path in sorted({*by_path, *(path for path in runs.iterdir() if _belongs(path, run_id))}):
         try:
@@ -248,22 +248,22 @@ def _folders_by_test(runs: Path, run_id: str, known: Sequence[RunFolder], tests:
         test = str(folder.data["test"])
         if test not in tests:
             unclear.append(f"{path / 'run.json'}: test: expected one of {', '.join(tests)}; found {test!a:.100}")
-        elif test in found:
-            unclear.append(f"{path} and {found[test].path} are of the same test, {test!r}")
-        found.setdefault(test, folder)
+        elif test in folders:
+            unclear.append(f"{path} and {folders[test].path} are of the same test, {test!r}")
+        folders.setdefault(test, folder)
     if unclear:
         what = (
             "The campaign cannot be continued, because it is unclear which tests were measured. Restore run.json from "
             f"a copy, or move the folder out of {runs} to measure its test again:"
         )
         raise RunError("\n  - ".join([what, *unclear]), code="campaign.tests.unclear")
-    return found
+    return folders
 
 
 def to_measure(campaign: CampaignPlan, folders: Mapping[str, RunFolder]) -> list[TestPlan]:
     """Return the tests whose raw data are not complete; ``folders`` are the run folders by test."""
-    found = [(test, folders.get(test.name)) for test in campaign.tests]
-    return [test for test, folder in found if folder is None or not (folder.finished or folder.data["acquired"])]
+    tests = [(test, folders.get(test.name)) for test in campaign.tests]
+    return [test for test, folder in tests if folder is None or not (folder.finished or folder.data["acquired"])]
 
 
 def _belongs(path: Path, run_id: str) -> bool:

@@ -41,23 +41,23 @@ def truth_of(folder: RunFolder) -> xr.Dataset:
     with datasets.load(folder.errors) as errors:
         start = str(errors.attrs.get("start") or later(clock["start"], clock["time"]))
         stated = errors.attrs["component"] != "beam" and plugins.states(method, "truth")
-        found: xr.Dataset | None = method().truth(machine, errors, between(clock["start"], start)) if stated else None
-        if found is None:
+        truth: xr.Dataset | None = method().truth(machine, errors, between(clock["start"], start)) if stated else None
+        if truth is None:
             raise RunError(
                 f"{folder.path}: the method does not state the true errors of {errors.attrs['component']}",
                 code="truth.not_stated",
             )
-        found = found.assign_attrs(
+        truth = truth.assign_attrs(
             {key: errors.attrs[key] for key in ("machine", "frame", "lever_axes") if key in errors.attrs}, start=start
         )
-        found["covariance"] = found["covariance"] + EXACTNESS**2 * np.eye(6)
+        truth["covariance"] = truth["covariance"] + EXACTNESS**2 * np.eye(6)
     try:
-        datasets.validate(found)
+        datasets.validate(truth)
     except DatasetError as error:
         raise RunError(
             f"{folder.path}: the true errors are not a valid error dataset: {error}", code="schema.violated"
         ) from error
-    return found
+    return truth
 
 
 def machine_of(folder: RunFolder) -> VirtualMachine:
@@ -78,13 +78,13 @@ def machine_of(folder: RunFolder) -> VirtualMachine:
         )
     plan = parse_bench(bench["text"], folder.path / f"run.json ({bench['file']})")
     addresses = [parse_address(each.address) for each in plan.instruments if each.address]
-    found = {(each.host, int(each.number("seed", 0))) for each in addresses if each.scheme == "sim"}
-    if len(found) != 1:
-        names = ", ".join(f"sim://{host} with seed {seed}" for host, seed in sorted(found)) or "none"
+    machines = {(each.host, int(each.number("seed", 0))) for each in addresses if each.scheme == "sim"}
+    if len(machines) != 1:
+        names = ", ".join(f"sim://{host} with seed {seed}" for host, seed in sorted(machines)) or "none"
         raise RunError(
             f"{folder.path}: expected one virtual machine on the bench; found {names}", code="truth.machine.ambiguous"
         )
-    ((name, seed),) = found
+    ((name, seed),) = machines
     machine = VirtualMachine(plan.description if name == NAME and plan.description else name, seed=seed)
     try:
         machine.start([Event(**event) for event in clock["schedule"]])

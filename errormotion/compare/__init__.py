@@ -113,7 +113,7 @@ def _temperatures(datasets: Mapping[str, xr.Dataset], common: ComparableErrors) 
         return {}
     from errormotion.datasets.timing import between
 
-    grid, found = np.asarray(common.coords["time"].values, dtype=float), {}
+    grid, temperatures = np.asarray(common.coords["time"].values, dtype=float), {}
     for name, ds in datasets.items():
         if "temperature" not in ds.coords or "time" not in ds["temperature"].dims:
             continue
@@ -123,5 +123,7 @@ def _temperatures(datasets: Mapping[str, xr.Dataset], common: ComparableErrors) 
         labels = [str(each) for each in ds["sensor"].values] if "sensor" in ds.coords else [""]
         for k, label in enumerate(labels[: temperature.shape[1]]):
             if np.isfinite(temperature[:, k]).all():
-                found[f"temperature {label} of '{name}'".replace("  ", " ")] = np.interp(grid, t, temperature[:, k])
-    return found
+                temperatures[f"temperature {label} of '{name}'".replace("  ", " ")] = np.interp(
+                    grid, t, temperature[:, k]
+                )
+    return temperatures

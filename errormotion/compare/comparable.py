@@ -203,17 +203,18 @@ def _stored(
     place: str,
 ) -> dict[str, Stored]:
     """Return the errors of each dataset as a function of the errors that it states."""
-    found = {}
+    coordinates = {}
     for name, each in errors.items():
         own = np.array(datasets[name].attrs["functional_point"], dtype=float)
-        found[name] = Stored(each, np.zeros(3) if component == "beam" else point - own)
+        coordinates[name] = Stored(each, np.zeros(3) if component == "beam" else point - own)
     if component in LINEAR_AXES and (letter := "xyz"[direction_of(component)]) in coords:
         q = np.asarray(coords[letter].values, dtype=float)
         line = partial(chain.from_line, positions=q, axis=component)
-        found = {
-            name: replace(each, levers=chain.levers(place, q, component), line=line) for name, each in found.items()
+        coordinates = {
+            name: replace(each, levers=chain.levers(place, q, component), line=line)
+            for name, each in coordinates.items()
         }
-    return found
+    return coordinates
 
 
 def parts_compared(component: str) -> set[str]:
@@ -321,8 +322,8 @@ def _dimension(datasets: Mapping[str, xr.Dataset]) -> str:
         raise DatasetError(
             f"The errors of the datasets depend on different dimensions ({stated})", code="compare.dims.differ"
         )
-    found = next(iter(dims.values()))
-    return str(found[0]) if found else ""
+    dim = next(iter(dims.values()))
+    return str(dim[0]) if dim else ""
 
 
 def _on_one_axis(datasets: Mapping[str, xr.Dataset], same_start: bool, notes: list[str]) -> dict[str, xr.Dataset]:

@@ -55,19 +55,19 @@ def consensus(estimates: Sequence[Estimate]) -> Consensus:
     degrees = int((count - (count > 0)).sum())
     left_degrees = [int((rest - (rest > 0)).sum()) for rest in count - known]
     if not short(parts, len(keys)):
-        found = solve(parts, len(keys))
+        solution = solve(parts, len(keys))
         left = [
             max(solve([part for part in parts if part is not each], len(keys)).square, 0.0) if its else 0.0
             for each, its in zip(parts, left_degrees, strict=True)
         ]
     else:
         reduced = Reduced.of(parts, len(keys))
-        found = reduced.solution()
-        left = np.maximum(found.square - reduced.decreases(), 0.0).tolist()
-    fit = ChiSquare(max(found.square, 0.0), degrees)
+        solution = reduced.solution()
+        left = np.maximum(solution.square - reduced.decreases(), 0.0).tolist()
+    fit = ChiSquare(max(solution.square, 0.0), degrees)
     rest = [ChiSquare(square, its) for square, its in zip(left, left_degrees, strict=True)]
     without = [ChiSquare(max(fit.value - each.value, 0.0), degrees - each.degrees) for each in rest]
-    estimate = _estimate(found, estimates)
+    estimate = _estimate(solution, estimates)
     return Consensus(estimate, fit, without, _holm([each.p for each in without]), rest)
 
 
@@ -79,10 +79,14 @@ def information(estimates: Sequence[Estimate]) -> tuple[dict[str, int], list[Inf
     return keys, parts
 
 
-def _estimate(found: Solution, estimates: Sequence[Estimate]) -> Estimate:
-    value, own, influence = np.where(found.seen, found.value, np.nan), found.own.copy(), found.influence.copy()
+def _estimate(solution: Solution, estimates: Sequence[Estimate]) -> Estimate:
+    value, own, influence = (
+        np.where(solution.seen, solution.value, np.nan),
+        solution.own.copy(),
+        solution.influence.copy(),
+    )
     for each in estimates:  # zero by definition in the reference state
-        zero = (each.known & (each.variance() == 0) & ~found.seen).any(axis=1)
+        zero = (each.known & (each.variance() == 0) & ~solution.seen).any(axis=1)
         value[zero] = np.where(np.isnan(value[zero]), 0.0, value[zero])
         own[zero] = 0.0
         influence[:, zero] = 0.0
@@ -96,11 +100,11 @@ def _estimate(found: Solution, estimates: Sequence[Estimate]) -> Estimate:
 def _holm(p: Sequence[float]) -> list[float]:
     """Return probabilities corrected for their number (Holm 1979)."""
     order = np.argsort(p)
-    found, largest = np.ones(len(p)), 0.0
+    adjusted, largest = np.ones(len(p)), 0.0
     for rank, i in enumerate(order):
         largest = max(largest, min(1.0, (len(p) - rank) * p[i]))
-        found[i] = largest
-    return found.tolist()
+        adjusted[i] = largest
+    return adjusted.tolist()
 
 
 def random_effects(estimates: Sequence[Estimate]) -> tuple[Array, Array, Array]:

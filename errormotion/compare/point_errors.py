@@ -137,8 +137,8 @@ class Stored:
 
     def _from_own(self, A: Array) -> Array:
         """Return matrices that act at the functional point of the dataset as those that act at the common one."""
-        found: Array = self.transfer @ A @ self._back
-        return found
+        values: Array = self.transfer @ A @ self._back
+        return values
 
     @cached_property
     def _exact(self) -> PointErrors:

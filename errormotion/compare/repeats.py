@@ -72,25 +72,25 @@ def labels(datasets: Mapping[str, xr.Dataset], by: str) -> dict[str, str]:
     """
     if by not in BY[1:]:
         raise DatasetError(f"Expected groups by {', '.join(BY)}; found '{by}'", code="repeats.group.unknown")
-    found = {name: _label(ds, by) for name, ds in datasets.items()}
-    if missing := [name for name, label in found.items() if not label]:
+    by_name = {name: _label(ds, by) for name, ds in datasets.items()}
+    if missing := [name for name, label in by_name.items() if not label]:
         raise DatasetError(
             f"{', '.join(map(repr, missing))}: no {by} is stated, so that it cannot be assigned to a group. "
             + ("The provenance states no serial number" if by == "instrument" else f"Set the attribute '{by}'"),
             code="repeats.group.not_stated",
         )
-    return found
+    return by_name
 
 
 def _label(ds: xr.Dataset, by: str) -> str:
     if by != "instrument":
         return str(ds.attrs.get(by, "")).strip()
-    found = []
+    parts = []
     for entry in provenance.of(ds).get("instruments") or []:
         identity = entry.get("identity") if isinstance(entry, dict) else None
         if isinstance(identity, dict) and identity.get("serial_number"):
-            found.append(" ".join(str(identity[key]) for key in ("model", "serial_number") if identity.get(key)))
-    return ", ".join(sorted(found))
+            parts.append(" ".join(str(identity[key]) for key in ("model", "serial_number") if identity.get(key)))
+    return ", ".join(sorted(parts))
 
 
 def repeats(estimates: Sequence[Estimate], groups: Sequence[str]) -> Repeats:
@@ -154,8 +154,8 @@ def _contrasts(number: Array, count: int) -> tuple[Array, Array, float]:
 def _basis(projector: Array) -> Array:
     """Return orthonormal rows that span the range of a projector."""
     power, vectors = np.linalg.eigh(projector)
-    found: Array = vectors[:, power > 0.5].T
-    return found
+    basis: Array = vectors[:, power > 0.5].T
+    return basis
 
 
 def _mean_square(B: Array, Y: Array, V: Array) -> _Square | None:

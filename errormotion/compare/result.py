@@ -153,7 +153,7 @@ _SPREAD = {"": "value", "_low": "low", "_high": "high", "_degrees": "degrees", "
 def _causes(causes: Sequence[Sequence[Cause]]) -> dict[str, Any]:
     most = max([1, *(len(cause.sizes) for each in causes for cause in each[:CAUSES])])
     shape = (len(causes), CAUSES)
-    found: dict[str, Any] = {
+    variables: dict[str, Any] = {
         "cause": np.full(shape, "", dtype=object),
         "alike": np.full(shape, "", dtype=object),
         "cause_p": np.full(shape, np.nan),
@@ -165,63 +165,63 @@ def _causes(causes: Sequence[Sequence[Cause]]) -> dict[str, Any]:
     for i, each in enumerate(causes):
         for rank, cause in enumerate(each[:CAUSES]):
             at = (i, rank)
-            found["cause"][at], found["alike"][at] = cause.name, "; ".join(cause.alike)
-            found["cause_p"][at], found["log_likelihood_ratio"][at] = cause.p, cause.log_likelihood_ratio
+            variables["cause"][at], variables["alike"][at] = cause.name, "; ".join(cause.alike)
+            variables["cause_p"][at], variables["log_likelihood_ratio"][at] = cause.p, cause.log_likelihood_ratio
             for j, size in enumerate(cause.sizes):
-                found["size"][(*at, j)], found["size_u"][(*at, j)] = size.value, size.standard_uncertainty
-                found["size_name"][(*at, j)] = f"{size.name} ({size.unit})"
-    return {name: array.astype(str) if array.dtype == object else array for name, array in found.items()}
+                variables["size"][(*at, j)], variables["size_u"][(*at, j)] = size.value, size.standard_uncertainty
+                variables["size_name"][(*at, j)] = f"{size.name} ({size.unit})"
+    return {name: array.astype(str) if array.dtype == object else array for name, array in variables.items()}
 
 
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema, one sentence each."""
-    found = [f"attribute '{name}': missing" for name in ("machine", "component", "frame") if name not in ds.attrs]
+    messages = [f"attribute '{name}': missing" for name in ("machine", "component", "frame") if name not in ds.attrs]
     table = TABLE | (REPEATS if REPEATS.keys() & set(ds.variables) else {})
     own = {dim for dims, _ in table.values() for dim in dims}
     value = ds.variables.get("value")
     common = [dim for dim in (() if value is None else value.dims) if dim not in own]
     if len(common) > 1:
-        found.append(f"value: expected one common dimension at most; found {', '.join(map(str, common))}")
+        messages.append(f"value: expected one common dimension at most; found {', '.join(map(str, common))}")
     for name, (dims, meaning) in table.items():
         if name not in ds.variables:
-            found.append(f"{name}: missing; expected {meaning}")
+            messages.append(f"{name}: missing; expected {meaning}")
             continue
         expected = tuple(part for dim in dims for part in (common if dim == "..." else [dim]))
         if ds.variables[name].dims != expected:
-            found.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {ds.variables[name].dims}")
+            messages.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {ds.variables[name].dims}")
     for name in ("dataset", "pair", "dof", "dof_", "kind"):
         if name in ds.dims and name not in ds.coords:
-            found.append(f"{name}: missing; expected its labels")
-    found = found or _wrong_types(ds, table) or _wrong_covariances(ds)
-    if not found:
+            messages.append(f"{name}: missing; expected its labels")
+    messages = messages or _wrong_types(ds, table) or _wrong_covariances(ds)
+    if not messages:
         for name in ("p", "curve_p", "misfit_p", "rest_p", *(["spread_p"] if "spread_p" in ds.variables else [])):
             values = ds.variables[name].values
             if values.dtype.kind != "f" or ((values < 0) | (values > 1)).any():
-                found.append(f"{name}: expected probabilities from 0 to 1")
-    return found
+                messages.append(f"{name}: expected probabilities from 0 to 1")
+    return messages
 
 
 _TEXTS = ("cause", "size_name", "alike", "group")
 
 
 def _wrong_types(ds: xr.Dataset, table: Mapping[str, Any]) -> list[str]:
-    found = []
+    messages = []
     for name in table:
         variable = ds.variables[name]
         expected, kinds = ("text", "UO") if name in _TEXTS else ("numbers", "fiu")
         if variable.size and variable.dtype.kind not in kinds:
-            found.append(f"{name}: expected {expected}; found {variable.dtype}")
-    return found
+            messages.append(f"{name}: expected {expected}; found {variable.dtype}")
+    return messages
 
 
 def _wrong_covariances(ds: xr.Dataset) -> list[str]:
-    found = []
+    messages = []
     for values, name in _COVARIANCES.items():
-        found += matrix_violations(name, ds.variables[name].values, np.isnan(ds.variables[values].values))
+        messages += matrix_violations(name, ds.variables[name].values, np.isnan(ds.variables[values].values))
     for name in ("robust_uncertainty", "between", "size_u"):
         if (ds.variables[name].values < 0).any():
-            found.append(f"{name}: expected standard uncertainties of 0 or more")
-    return found
+            messages.append(f"{name}: expected standard uncertainties of 0 or more")
+    return messages
 
 
 _COVARIANCES = {

@@ -39,7 +39,7 @@ def spreads(ds: xr.Dataset) -> list[Spread]:
     """Return repeatability and reproducibility of a comparison with groups; empty without groups."""
     if "spread" not in ds.variables:
         return []
-    found = []
+    texts = []
     for k, freedom in enumerate(str(name) for name in ds["dof"].values):
         factor, unit = (1e6, "um") if freedom in ("EX", "EY", "EZ") else FIELD["rad"]
         for i, kind in enumerate(str(name) for name in ds["kind"].values):
@@ -50,11 +50,11 @@ def spreads(ds: xr.Dataset) -> list[Spread]:
             if np.isfinite(value):
                 p = probability(float(ds["spread_p"].values[i, k]))
                 interval = f"{low:.3g} to {high:.3g}"
-                found.append(Spread(freedom, kind, f"{value:.3g}", interval, f"{stated:.3g}", p, unit))
+                texts.append(Spread(freedom, kind, f"{value:.3g}", interval, f"{stated:.3g}", p, unit))
         common = factor * float(ds["common"].values[k])
         if np.isfinite(common):
-            found.append(Spread(freedom, "shared by all", "", "", f"{common:.3g}", "", unit))
-    return found
+            texts.append(Spread(freedom, "shared by all", "", "", f"{common:.3g}", "", unit))
+    return texts
 
 
 SPREAD_HEAD = ["freedom", "standard deviation", "found", "95 % interval", "stated", "p", "unit"]

@@ -43,16 +43,16 @@ def certificates_of(attrs: Mapping[Any, Any]) -> dict[str, str]:
     if stated is None:
         return {}
     try:
-        found = json.loads(stated)
+        certificates = json.loads(stated)
     except (TypeError, ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or wrong(found):
+        certificates = None
+    if not isinstance(certificates, dict) or wrong(certificates):
         raise DatasetError(
             f"attribute '{ATTRIBUTE}': expected a JSON object with texts of up to {LONGEST} characters for "
             f"{', '.join(ITEMS)}; found {str(stated)[:80]!r}",
             code="certificate.form",
         )
-    return found
+    return certificates
 
 
 def wrong(certificates: Mapping[Any, Any]) -> list[str]:

@@ -36,17 +36,17 @@ def magnitude_violations(name: str, variable: xr.Variable, row: Row) -> list[str
     """Return violations of type, unit and magnitude of the values of a variable, of a sample if it is large."""
     if variable.dtype.kind not in "fiu":
         return [f"{name}: expected numbers (float64); found {_dtype(variable)}"]
-    found = unit_violations(name, variable.attrs, row.unit) + _of_several(name, variable.attrs, row.units)
+    messages = unit_violations(name, variable.attrs, row.unit) + _of_several(name, variable.attrs, row.units)
     values = sample(variable).astype(float)
     if np.isinf(values).any():
-        found.append(f"{name}: expected finite numbers, NaN where unknown; found an infinite one")
+        messages.append(f"{name}: expected finite numbers, NaN where unknown; found an infinite one")
     values = values[np.isfinite(values)]
     outside = values[(values < row.low) | (values > row.high)]
-    if outside.size and not found:
+    if outside.size and not messages:
         worst = float(outside[np.argmax(np.abs(outside))])
         unit = f" {row.unit}" if row.unit not in ("", "1") else ""
-        found.append(f"{name} = {number(worst)}{unit}: expected {_range(row)}{unit}{_guess(worst, row)}")
-    return found
+        messages.append(f"{name} = {number(worst)}{unit}: expected {_range(row)}{unit}{_guess(worst, row)}")
+    return messages
 
 
 def _range(row: Row) -> str:
@@ -73,24 +73,24 @@ def _of_several(name: str, attrs: Mapping[Any, Any], units: tuple[str, ...]) -> 
 
 def unit_violations(name: str, attrs: Mapping[Any, Any], unit: str) -> list[str]:
     """Return a sentence if the attribute ``units`` exists and is not the unit of the schema."""
-    found = attrs.get("units")
-    if found is None or not unit:
+    unit_found = attrs.get("units")
+    if unit_found is None or not unit:
         return []
-    if not isinstance(found, str):
-        return [f"{name}: expected units '{unit}'; found {found!r:.100}"]
-    if found == unit:
+    if not isinstance(unit_found, str):
+        return [f"{name}: expected units '{unit}'; found {unit_found!r:.100}"]
+    if unit_found == unit:
         return []
     if unit == "1":
-        if found.strip().lower() in ("", "dimensionless", "none"):
+        if unit_found.strip().lower() in ("", "dimensionless", "none"):
             return []
-        return [f"{name}: expected units '1' (a pure number); found '{found}'"]
+        return [f"{name}: expected units '1' (a pure number); found '{unit_found}'"]
     try:
-        same = convert(1.0, found, unit) == 1.0 and convert(0.0, found, unit) == 0.0
+        same = convert(1.0, unit_found, unit) == 1.0 and convert(0.0, unit_found, unit) == 0.0
     except DatasetError as error:
-        return [f"{name}: expected units '{unit}'; found '{found}': {error}"]
+        return [f"{name}: expected units '{unit}'; found '{unit_found}': {error}"]
     if same:
         return []
-    return [f"{name}: expected units '{unit}'; found '{found}'. Convert the values and set the attribute"]
+    return [f"{name}: expected units '{unit}'; found '{unit_found}'. Convert the values and set the attribute"]
 
 
 def matrix_violations(name: str, matrices: np.ndarray, unknown: np.ndarray) -> list[str]:
@@ -132,11 +132,13 @@ def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, order
     variable = ds.variables[dim]
     if variable.dims != (dim,):
         return [f"{dim}: expected a coordinate along '{dim}'; found dims {dims(variable)}"]
-    found = tuple(label.decode() if isinstance(label, bytes) else str(label) for label in variable.values.tolist())
-    missing = [label for label in labels if label not in found]
-    unknown = [label for label in found if label not in labels]
-    twice = sorted({label for label in found if found.count(label) > 1})
-    what = f"{dim}: expected {' '.join(labels)}; found {' '.join(found) or 'nothing'}"
+    labels_found = tuple(
+        label.decode() if isinstance(label, bytes) else str(label) for label in variable.values.tolist()
+    )
+    missing = [label for label in labels if label not in labels_found]
+    unknown = [label for label in labels_found if label not in labels]
+    twice = sorted({label for label in labels_found if labels_found.count(label) > 1})
+    what = f"{dim}: expected {' '.join(labels)}; found {' '.join(labels_found) or 'nothing'}"
     complaints = [
         f"{word} {' '.join(names)}"
         for word, names in (("missing", missing), ("unknown", unknown), ("repeated", twice))
@@ -144,7 +146,7 @@ def label_violations(ds: xr.Dataset, dim: str, labels: tuple[str, ...], *, order
     ]
     if complaints:
         return [f"{what}: {', '.join(complaints)}"]
-    return [f"{what}: in another order"] if ordered and found != labels else []
+    return [f"{what}: in another order"] if ordered and labels_found != labels else []
 
 
 def time_violations(name: str, variable: xr.Variable) -> list[str]:
@@ -170,7 +172,7 @@ def storable_violations(ds: xr.Dataset) -> list[str]:
     """Return what a NetCDF file cannot store: attributes except text, numbers, flat arrays of them; text with NUL."""
     owners: list[tuple[str, Mapping[Any, Any]]] = [("", ds.attrs)]
     owners += [(f"{name}: ", variable.attrs) for name, variable in ds.variables.items()]
-    found = [
+    messages = [
         f"{owner}attribute '{name}': expected text, a number or a flat array of them; found {_what(value)}"
         for owner, attrs in owners
         for name, value in attrs.items()
@@ -178,8 +180,8 @@ def storable_violations(ds: xr.Dataset) -> list[str]:
     ]
     for name, variable in ds.variables.items():
         if variable.dtype.kind in "UTO" and any("\0" in str(text) for text in variable.values.flat):
-            found.append(f"{name}: expected text without the character NUL")
-    return found
+            messages.append(f"{name}: expected text without the character NUL")
+    return messages
 
 
 def _storable(value: Any) -> bool:

@@ -163,8 +163,8 @@ class RecordClock:
         """Return the attributes of the store at this instant."""
         now, first = steady(), self._first
         state = asdict(read(first.began, first.elapsed + max(now - first.steady, 0.0)))
-        found = {CLOCK: json.dumps(state)}
-        return found | ({JOINS: json.dumps([asdict(join) for join in self._joins])} if self._joins else {})
+        attributes = {CLOCK: json.dumps(state)}
+        return attributes | ({JOINS: json.dumps([asdict(join) for join in self._joins])} if self._joins else {})
 
 
 def age(done: xr.Dataset) -> float:
@@ -197,9 +197,9 @@ def restarted(done: xr.Dataset, now: float) -> bool:
 def _stored(attrs: Mapping[Any, Any]) -> Reading | None:
     """Return the reading at the last commit; None if it is missing or damaged."""
     try:
-        found = json.loads(attrs[CLOCK])
-        wall, since, began, elapsed = (float(found[name]) for name in ("wall", "steady", "began", "elapsed"))
-        boot = str(found["boot"])
+        state = json.loads(attrs[CLOCK])
+        wall, since, began, elapsed = (float(state[name]) for name in ("wall", "steady", "began", "elapsed"))
+        boot = str(state["boot"])
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         return None
     if not all(map(math.isfinite, (wall, since, began, elapsed))):

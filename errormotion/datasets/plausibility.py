@@ -53,10 +53,10 @@ def of_result(errors: xr.Dataset) -> list[str]:
         names, units, dims = list(DOF), list(ERROR_UNITS), errors[DOF[0]].dims
         size = np.abs(np.stack([errors[name].values for name in names], axis=-1)).reshape(-1, 6)
         u = np.sqrt(np.diagonal(errors["covariance"].values, axis1=-2, axis2=-1)).reshape(-1, 6)
-    found, extent = list[str](), _extent(errors, dims)
+    notes, extent = list[str](), _extent(errors, dims)
     for unit, (low, high) in ERRORS.items():
         columns = [k for k, each in enumerate(units) if each == unit and np.isfinite(size[:, k]).any()]
-        if not columns or found:
+        if not columns or notes:
             continue
         its, place = size[:, columns], int(np.nanargmax(size[:, columns]))
         largest, name = float(its.flat[place]), names[columns[place % len(columns)]]
@@ -64,17 +64,17 @@ def of_result(errors: xr.Dataset) -> list[str]:
             low, high = (max(pair) for pair in zip((low, high), np.multiply(OF_TRAVEL, extent), strict=True))
         what = f"The largest error, {name} = {_shown(largest, unit)}, is"
         if largest > high:
-            found.append(
+            notes.append(
                 f"{what} more than machine tools have (up to {_shown(high, unit)} here){_probably(largest, unit)}. "
                 "Check the unit of the readings."
             )
         # errors at rest may be as small as they like, but not smaller than it is known how small they are
         still = set(dims) <= {"time"} or np.isfinite(its).sum() < FEWEST
         if largest > 0 and (np.nanmax(its + 2.0 * u[:, columns]) if still else largest) < low:
-            found.append(
+            notes.append(
                 f"{what} less than machine tools have ({_shown(low, unit)} or more). Check the unit of the readings."
             )
-    return found
+    return notes
 
 
 def _extent(errors: xr.Dataset, dims: Sequence[Hashable]) -> float:
@@ -133,18 +133,18 @@ def _frozen(raw: xr.Dataset, variable: xr.Variable, name: str) -> Iterator[str]:
         rest = [each for each in others if each != dim]
         y = variable.transpose(*rest, dim, *vector).values.astype(float)
         shape = [variable.sizes[each] for each in rest]
-        found = frozen(y.reshape(-1, variable.sizes[dim], *y.shape[len(rest) + 1 :]))
-        if found is None:
+        run = frozen(y.reshape(-1, variable.sizes[dim], *y.shape[len(rest) + 1 :]))
+        if run is None:
             continue
-        if found.every:
+        if run.every:
             yield f"{name}: all readings are equal. An instrument that hangs, or a wrong column?"
             return
-        at = np.unravel_index(found.series, shape) if shape else ()
+        at = np.unravel_index(run.series, shape) if shape else ()
         where = [f"{each} {_label(raw, each, int(i))}" for each, i in zip(rest, at, strict=True)]
-        first, last = (_label(raw, dim, found.first + k) for k in (0, found.count - 1))
+        first, last = (_label(raw, dim, run.first + k) for k in (0, run.count - 1))
         where.append(f"{dim} {first} to {last}")
         yield (
-            f"{name}: {found.count} successive readings are equal ({', '.join(where)}), which their scatter excludes. "
+            f"{name}: {run.count} successive readings are equal ({', '.join(where)}), which their scatter excludes. "
             "An instrument that hangs, or a gap that was filled? Remove them, or measure again."
         )
         return

@@ -117,13 +117,13 @@ def of(ds: xr.Dataset) -> dict[str, Any]:
 
 @cache
 def _versions() -> tuple[tuple[str, str], ...]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "not installed"
-    return tuple(found.items())
+            versions[package] = "not installed"
+    return tuple(versions.items())
 
 
 def _software() -> dict[str, str]:

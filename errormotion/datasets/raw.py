@@ -30,11 +30,11 @@ def variant_of(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> RawSchema | 
     ``tables`` are searched before the raw schemas of the installed plugins.
     """
     schema = str(ds.attrs.get("schema"))
-    found = tuple(table for table in tables if table.id == schema) or variants(schema)
-    for raw in found:
+    candidates = tuple(table for table in tables if table.id == schema) or variants(schema)
+    for raw in candidates:
         if raw.marker in ds.variables or raw.marker in ds.dims:
             return raw
-    return found[0] if found else None
+    return candidates[0] if candidates else None
 
 
 def raw_violations(ds: xr.Dataset, raw: RawSchema) -> list[str]:
@@ -42,20 +42,20 @@ def raw_violations(ds: xr.Dataset, raw: RawSchema) -> list[str]:
 
     Large variables are checked in samples distributed over the record; they are never loaded completely.
     """
-    found = [*storable_violations(ds), *straightness_reference_violations(ds)]
+    messages = [*storable_violations(ds), *straightness_reference_violations(ds)]
     for dim, size in raw.sizes.items():
         if dim in ds.sizes and ds.sizes[dim] != size and dim not in raw.labels:
-            found.append(f"dimension {dim}: expected {size}; found {ds.sizes[dim]}")
+            messages.append(f"dimension {dim}: expected {size}; found {ds.sizes[dim]}")
     for dim, labels in raw.labels.items():
         if dim not in ds.sizes:
             continue
         if dim in ds.variables or dim == "channel":
-            found += label_violations(ds, dim, labels, ordered=dim != "channel")
+            messages += label_violations(ds, dim, labels, ordered=dim != "channel")
         elif ds.sizes[dim] != len(labels):
-            found.append(f"dimension {dim}: expected {len(labels)} ({' '.join(labels)}); found {ds.sizes[dim]}")
+            messages.append(f"dimension {dim}: expected {len(labels)} ({' '.join(labels)}); found {ds.sizes[dim]}")
     for row in raw.rows:
-        found += list(_row_violations(ds, row))
-    return found
+        messages += list(_row_violations(ds, row))
+    return messages
 
 
 def _row_violations(ds: xr.Dataset, row: Row) -> Iterator[str]:

@@ -271,8 +271,8 @@ def variants(schema: str) -> tuple[RawSchema, ...]:
 
 def raw_schemas() -> tuple[RawSchema, ...]:
     """Return the raw schemas of all plugins."""
-    found = (table for _, tables in plugins.brought("raw_schemas", "methods", "datasets") for table in tables)
-    return tuple(table for table in found if isinstance(table, RawSchema))
+    schemas = (table for _, tables in plugins.brought("raw_schemas", "methods", "datasets") for table in tables)
+    return tuple(table for table in schemas if isinstance(table, RawSchema))
 
 
 def known_schemas() -> set[str]:

@@ -121,8 +121,10 @@ class Quantity:
         """Return a suggestion for a unit that is unknown or of another kind; empty if there is none."""
         usual = _USUAL.get(self.unit, ())
         plain = unit.replace(" ", "")
-        found = [known for known in usual if known.lower() == plain.lower()] or get_close_matches(plain, usual, 3, 0.5)
-        return f"; did you mean {' or '.join(repr(each) for each in found)}?" if found else ""
+        similar = [known for known in usual if known.lower() == plain.lower()] or get_close_matches(
+            plain, usual, 3, 0.5
+        )
+        return f"; did you mean {' or '.join(repr(each) for each in similar)}?" if similar else ""
 
     def _validate(self, value: Any, info: core_schema.ValidationInfo) -> Any:
         if isinstance(value, str):

@@ -55,11 +55,11 @@ def explained(path: str | Path, ds: xr.Dataset) -> Iterator[None]:
     except ErrormotionError:
         raise
     except Exception as error:
-        found = violations(ds)
-        if not found:
+        messages = violations(ds)
+        if not messages:
             raise
         raise DatasetError(
-            f"{path}: breaks its schema ({ds.attrs.get('schema', 'none given')}):", found, code="schema.violated"
+            f"{path}: breaks its schema ({ds.attrs.get('schema', 'none given')}):", messages, code="schema.violated"
         ) from error
 
 
@@ -71,10 +71,10 @@ def validate(ds: xr.Dataset, tables: Sequence[RawSchema] = ()) -> None:
     DatasetError
         Its attribute ``violations`` contains one sentence for each violation.
     """
-    found = violations(ds, tables)
-    if found:
+    messages = violations(ds, tables)
+    if messages:
         raise DatasetError(
-            f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", found, code="schema.violated"
+            f"The dataset breaks its schema ({ds.attrs.get('schema', 'none given')}):", messages, code="schema.violated"
         )
 
 
@@ -89,9 +89,11 @@ def checked_raw(raw: xr.Dataset, method: plugins.Method) -> xr.Dataset:
         It has the schema of another method.
     """
     schema = method.needs.raw_schema
-    found = raw.attrs.get("schema", schema)
-    now = plugins.present_schema(str(found), method)
+    schema_found = raw.attrs.get("schema", schema)
+    now = plugins.present_schema(str(schema_found), method)
     validate(raw.assign_attrs(schema=now), tuple(method.raw_schemas))
     if now != schema:
-        raise MethodError(f"{method.info.id} reads raw data of schema {schema}; found {found}.", code="schema.other")
-    return raw.assign_attrs(schema=found)
+        raise MethodError(
+            f"{method.info.id} reads raw data of schema {schema}; found {schema_found}.", code="schema.other"
+        )
+    return raw.assign_attrs(schema=schema_found)

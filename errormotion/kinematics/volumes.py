@@ -138,12 +138,12 @@ class Volume:
 
     def terms(self, order: int = ORDERS) -> list[Term]:
         """Return all terms up to an order, at least 2: squareness, displacements, then rotations."""
-        found = [Term(name, -1) for name in self.locations]
+        terms = [Term(name, -1) for name in self.locations]
         for rotations in (False, True):
             for name in self.motions:
                 if is_rotation(name) == rotations:
-                    found += [Term(name, n) for n in range(first_order(name), max(order, 2) + 1)]
-        return found
+                    terms += [Term(name, n) for n in range(first_order(name), max(order, 2) + 1)]
+        return terms
 
     def columns(self, terms: Sequence[Term], position: Array, tool: Array, freedoms: int = 3) -> Array:
         """Return the effect of one unit of each term, (m, freedoms, term), at positions (m, axis) with tools (m, 3)."""
@@ -159,9 +159,9 @@ class Volume:
         index = [self.machine.error_names.index(term.error) for term in terms]
         axis = [0 if term.order < 0 else self.axis(term.error) for term in terms]
         value = np.where([term.order < 0 for term in terms], 1.0, P[:, axis, [max(term.order, 0) for term in terms]])
-        found = np.take(J, index, axis=2)
-        found *= value[:, None, :]
-        return found
+        columns = np.take(J, index, axis=2)
+        columns *= value[:, None, :]
+        return columns
 
     def wholes(self, position: Array, tool: Array, centre: Array, freedoms: int = 3) -> Array:
         """Return the effect of motions of the whole about ``centre``, (m, freedoms, 6).
@@ -171,9 +171,9 @@ class Volume:
         G = rigid_motions(self.points(position, tool), centre)
         if freedoms == 3:
             return G
-        found = np.zeros((len(G), 6, 9))
-        found[:, :3, :6], found[:, 3:, 3:6], found[:, 3:, 6:] = G, np.eye(3), np.eye(3)
-        return found
+        wholes = np.zeros((len(G), 6, 9))
+        wholes[:, :3, :6], wholes[:, 3:, 3:6], wholes[:, 3:, 6:] = G, np.eye(3), np.eye(3)
+        return wholes
 
     def points(self, position: Array, tool: Array) -> Array:
         """Return the commanded points of the tool in the workpiece frame, (m, 3), m."""
@@ -263,12 +263,12 @@ class AxisErrors:
     def design(self, motion: str, position: Array) -> Array:
         """Return the derivative of an error motion at axis positions (k,) by the coefficients, (k, term)."""
         index = [k for k, term in enumerate(self.terms) if term.error == motion]
-        found = np.zeros((len(position), len(self.terms)))
+        design = np.zeros((len(position), len(self.terms)))
         if index:
             orders = [self.terms[k].order for k in index]
             interval = self.volume.interval(self.volume.axis(motion))
-            found[:, index] = interval.polynomials(position, max(orders))[:, orders]
-        return found
+            design[:, index] = interval.polynomials(position, max(orders))[:, orders]
+        return design
 
     def rest_at(self, motion: str, position: Array) -> Array:
         """Return the variance (k,) of an error motion by its orders above the fitted ones."""
@@ -315,18 +315,18 @@ def fitted(volume: Volume, targets: Targets, order: int = ORDERS) -> AxisErrors:
     group, orders = np.full(len(N), -1, dtype=np.intp), np.zeros(len(N))
     group[:n] = [motions.index(term.error) if has_prior(term) else -1 for term in terms]
     orders[:n] = [term.order for term in terms]
-    found = estimated(N, b, group, orders, np.array([is_rotation(name) for name in motions], dtype=np.intp))
-    residual = square - 2 * float(b @ found.value) + float(found.value @ N @ found.value)
-    freedom = count - float(found.determined.sum())
+    estimate = estimated(N, b, group, orders, np.array([is_rotation(name) for name in motions], dtype=np.intp))
+    residual = square - 2 * float(b @ estimate.value) + float(estimate.value @ N @ estimate.value)
+    freedom = count - float(estimate.determined.sum())
     ratio = max(residual, 0.0) / max(freedom, 1.0)
     factor = ratio if freedom > 0 and residual > chdtri(freedom, FALSE_ALARM) else 1.0
-    of_sources = found.within @ gain
+    of_sources = estimate.within @ gain
     shared = of_sources @ of_sources.T
-    covariance = factor * (found.covariance - shared) + shared
-    rest = rest_of(found, max(order, 2))
+    covariance = factor * (estimate.covariance - shared) + shared
+    rest = rest_of(estimate, max(order, 2))
     return AxisErrors(
-        volume, terms, found.value[:n], covariance[:n, :n], of_sources[:n],
-        dict(zip(motions, rest, strict=True)), found.determined[:n], undetermined, found.exponent,
+        volume, terms, estimate.value[:n], covariance[:n, :n], of_sources[:n],
+        dict(zip(motions, rest, strict=True)), estimate.determined[:n], undetermined, estimate.exponent,
         float(np.sqrt(ratio)), factor, freedom, datum, centre,
     )  # fmt: skip
 

@@ -54,11 +54,11 @@ def changes_machine(driver: Any) -> tuple[str, ...]:
 
 
 def _changes(driver: Any, protocol: Any) -> tuple[str, ...]:
-    found: list[str] = []
+    changes: list[str] = []
     for capability in getattr(protocol, "capabilities", ()):
         if getattr(capability, "changes_machine", False) and _has(driver, _first(capability)):
-            found += members(capability)
-    return tuple(dict.fromkeys(found))
+            changes += members(capability)
+    return tuple(dict.fromkeys(changes))
 
 
 def kind_changes_machine(name: str) -> bool:
@@ -83,17 +83,17 @@ def kind(name: str) -> Any:
     if point is None:
         return None
     try:
-        found = point.load()
+        loaded = point.load()
     except Exception as error:
         raise PluginError(
             f"The kind '{name}' ({point.value}) does not load: {type(error).__name__}: {error}",
             code="plugin.kind.not_loaded",
         ) from error
-    if not getattr(found, "_is_protocol", False):
+    if not getattr(loaded, "_is_protocol", False):
         raise PluginError(
-            f"The kind '{name}': expected a Protocol class at {point.value}; found {found!r}", code="plugin.kind.form"
+            f"The kind '{name}': expected a Protocol class at {point.value}; found {loaded!r}", code="plugin.kind.form"
         )
-    return found
+    return loaded
 
 
 def refresh() -> None:
@@ -109,23 +109,23 @@ def plausible(name: str) -> tuple[float, float] | None:
 
 def members(protocol: type) -> dict[str, Any]:
     """Return the members of a Protocol: a function for a method, None for an attribute."""
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for base in reversed(protocol.__mro__):
         if getattr(base, "_is_protocol", False):
             for name in (*vars(base).get("__annotations__", {}), *vars(base)):
                 value = vars(base).get(name)
                 if not name.startswith("_") and name not in _NO_MEMBERS:
-                    found[name] = value if inspect.isfunction(value) else None
-    return found
+                    by_name[name] = value if inspect.isfunction(value) else None
+    return by_name
 
 
 def members_of(driver: Any, protocol: Any) -> dict[str, Any]:
     """Return the members of a contract and of its capabilities that a driver has; see `members`."""
-    found = members(protocol)
+    by_name = members(protocol)
     for capability in getattr(protocol, "capabilities", ()):
         if _has(driver, _first(capability)):
-            found |= members(capability)
-    return {name: method for name, method in found.items() if _has(driver, name)}
+            by_name |= members(capability)
+    return {name: method for name, method in by_name.items() if _has(driver, name)}
 
 
 def deviations(driver: Any, protocol: type) -> list[str]:
@@ -138,22 +138,22 @@ def deviations(driver: Any, protocol: type) -> list[str]:
     protocol : type
         The contract of its kind.
     """
-    found = _lacking(driver, protocol)
+    texts = _lacking(driver, protocol)
     for capability in getattr(protocol, "capabilities", ()):
         if _has(driver, _first(capability)):
-            found += [f"{text} ({capability.__name__})" for text in _lacking(driver, capability)]
+            texts += [f"{text} ({capability.__name__})" for text in _lacking(driver, capability)]
     if _changes(driver, protocol):
         arm = type(driver).Settings.model_fields.get("arm")
         if arm is None or arm.default is not False:
-            found.append("it can change a machine: expected the setting 'arm' with the default false")
+            texts.append("it can change a machine: expected the setting 'arm' with the default false")
         if not callable(getattr(driver, "bound", None)):
-            found.append("it can change a machine: expected bound(limits: MachineLimits)")
-    return found
+            texts.append("it can change a machine: expected bound(limits: MachineLimits)")
+    return texts
 
 
 def _first(capability: type) -> str:
-    found = members(capability)
-    return next((name for name, method in found.items() if method), next(iter(found)))
+    names = members(capability)
+    return next((name for name, method in names.items() if method), next(iter(names)))
 
 
 def _has(driver: Any, name: str) -> bool:
@@ -163,20 +163,20 @@ def _has(driver: Any, name: str) -> bool:
 
 
 def _lacking(driver: Any, protocol: type) -> list[str]:
-    found = []
+    texts = []
     for name, method in members(protocol).items():
         if not _has(driver, name):
-            found.append(f"'{name}' is missing")
+            texts.append(f"'{name}' is missing")
             continue
         static = inspect.getattr_static(driver, name, None)
         if method is None:
             if inspect.isfunction(static):
-                found.append(f"'{name}' is a method, expected an attribute or property")
+                texts.append(f"'{name}' is a method, expected an attribute or property")
         elif not callable(static) and not isinstance(static, staticmethod | classmethod):
-            found.append(f"'{name}' is not a method, expected {name}{_shown(method)}")
+            texts.append(f"'{name}' is not a method, expected {name}{_shown(method)}")
         elif not _accepts(getattr(driver, name), method):
-            found.append(f"expected {name}{_shown(method)}, found {name}{inspect.signature(getattr(driver, name))}")
-    return found
+            texts.append(f"expected {name}{_shown(method)}, found {name}{inspect.signature(getattr(driver, name))}")
+    return texts
 
 
 def _shown(method: Any) -> str:
@@ -184,12 +184,12 @@ def _shown(method: Any) -> str:
     return str(signature.replace(parameters=list(signature.parameters.values())[1:]))
 
 
-def _accepts(found: Any, method: Any) -> bool:
+def _accepts(member: Any, method: Any) -> bool:
     """Whether a bound method accepts all calls that the method of the contract allows."""
     expected = list(inspect.signature(method).parameters.values())[1:]
     required = [each for each in expected if each.default is each.empty]
     try:
-        signature = inspect.signature(found)
+        signature = inspect.signature(member)
         for called in (required, expected):
             for by_name in (False, True):
                 named = [each for each in called if by_name or each.kind is each.KEYWORD_ONLY]

@@ -41,8 +41,8 @@ class Chart:
 
     def outside(self, value: Array) -> NDArray[np.bool_]:
         """Return which values are outside their limits, bool (n,)."""
-        found: NDArray[np.bool_] = (value < self.lower) | (value > self.upper)
-        return found
+        is_outside: NDArray[np.bool_] = (value < self.lower) | (value > self.upper)
+        return is_outside
 
 
 def chart(series: Series, model: Model) -> Chart:

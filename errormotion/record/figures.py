@@ -92,24 +92,24 @@ def figure_over_time(
             f"--at: expected --figure with a freedom, such as EZ; found '{figure}'", code="figure.place.without_figure"
         )
     names = {} if freedom else _names(dated, figure)
-    found = list[Reading]()
+    readings = list[Reading]()
     for path, entry in dated:
         if not freedom and path not in names:
             left_out.append(f"{entry.folder}: does not state the figure")
             continue
         try:
-            found.append(_of_freedom(path, entry, freedom, at) if freedom else _of_merit(path, entry, names[path]))
+            readings.append(_of_freedom(path, entry, freedom, at) if freedom else _of_merit(path, entry, names[path]))
         except ErrormotionError as error:
             left_out.append(f"{entry.folder}: {error}")
         except Exception as error:  # noqa: BLE001 - of a foreign plugin, or a damaged file
             left_out.append(f"{entry.folder}: {type(error).__name__}: {error}")
-    if not found:
+    if not readings:
         reasons = "".join(f"\n  - {reason}" for reason in left_out[:5])
         raise RunError(
             f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(dated)}{reasons}",
             code="figure.no_value",
         )
-    return FigureOverTime(_series(found), figure, tuple(left_out), tuple(_remarks(found, at)))
+    return FigureOverTime(_series(readings), figure, tuple(left_out), tuple(_remarks(readings, at)))
 
 
 def _time(entry: Entry) -> float:
@@ -128,7 +128,7 @@ def _available(runs: Sequence[tuple[Path, Entry]]) -> str:
 def _names(runs: Sequence[tuple[Path, Entry]], figure: str) -> dict[Path, FigureOfMerit]:
     """Return the figure of each run that states it, by the strictest match of the name in any run."""
     for agrees in (str.__eq__, lambda wanted, name: "*" in wanted and matches(wanted, name), _short):
-        found = {}
+        names = {}
         for path, entry in runs:
             own = [each for each in entry.figures or () if agrees(figure, each.name)]
             if len(own) > 1:
@@ -138,9 +138,9 @@ def _names(runs: Sequence[tuple[Path, Entry]], figure: str) -> dict[Path, Figure
                     code="figure.ambiguous",
                 )
             if own:
-                found[path] = own[0]
-        if found:
-            return found
+                names[path] = own[0]
+        if names:
+            return names
     raise RunError(
         f"No value of '{figure}' in {len(runs)} runs. Known figures: {_available(runs)}", code="figure.no_value"
     )
@@ -157,8 +157,8 @@ def _short(wanted: str, name: str) -> bool:
 
 def _parts(text: str) -> list[str | float]:
     """Return the words and numbers of a name."""
-    found = re.findall(r"\d+(?:\.\d+)?|[^\d\s]+", text)
-    return [float(each) if each[0].isdigit() else each for each in found]
+    parts = re.findall(r"\d+(?:\.\d+)?|[^\d\s]+", text)
+    return [float(each) if each[0].isdigit() else each for each in parts]
 
 
 def _of_merit(path: Path, entry: Entry, stated: FigureOfMerit) -> Reading:
@@ -288,34 +288,34 @@ def _version(errors: xr.Dataset) -> str:
     return " ".join(parts) if all(parts) else ""
 
 
-def _series(found: list[Reading]) -> Series:
+def _series(readings: list[Reading]) -> Series:
     """Return readings as a series; sources of a single run are part of its uncertainty."""
-    units = {each.unit for each in found}
+    units = {each.unit for each in readings}
     if len(units) > 1:
         raise RunError(
             f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only",
             code="figure.units.several",
         )
-    counts = Counter(identity for each in found for identity, effect in each.influence.items() if effect)
+    counts = Counter(identity for each in readings for identity, effect in each.influence.items() if effect)
     shared = sorted(identity for identity, count in counts.items() if count > 1)
-    F = np.array([[each.influence.get(identity, 0.0) for each in found] for identity in shared])
-    u = np.array([each.u for each in found])
+    F = np.array([[each.influence.get(identity, 0.0) for each in readings] for identity in shared])
+    u = np.array([each.u for each in readings])
     return Series(
-        np.array([each.time for each in found]),
-        np.array([each.value for each in found]),
+        np.array([each.time for each in readings]),
+        np.array([each.value for each in readings]),
         np.maximum(u, np.sqrt((F**2).sum(axis=0))) if shared else u,
-        F if shared else np.zeros((0, len(found))),
+        F if shared else np.zeros((0, len(readings))),
         shared,
-        [each.run for each in found],
-        [each.name for each in found],
+        [each.run for each in readings],
+        [each.name for each in readings],
         units.pop(),
-        [each.version for each in found],
+        [each.version for each in readings],
     )
 
 
-def _remarks(found: list[Reading], at: Any) -> list[str]:
+def _remarks(readings: list[Reading], at: Any) -> list[str]:
     """Return notes on differences between the runs that affect the comparison."""
-    known = [each.origin for each in found if len(each.origin) == 4]
+    known = [each.origin for each in readings if len(each.origin) == 4]
     notes = []
     for k, what in ((0, "methods"), (1, "components"), (2, "frames"), (3, "functional points (mm)")):
         values = sorted({origin[k] for origin in known})
@@ -328,7 +328,9 @@ def _remarks(found: list[Reading], at: Any) -> list[str]:
                 else " Choose one by --method or --test."
             )
             notes.append(f"The runs state several {what}: {'; '.join(values[:5])}.{advice}")
-    lacking = len(found) - len(known)
+    lacking = len(readings) - len(known)
     if lacking and known:
-        notes.append(f"{lacking} of {len(found)} runs have no error dataset; their sources are treated as independent.")
+        notes.append(
+            f"{lacking} of {len(readings)} runs have no error dataset; their sources are treated as independent."
+        )
     return notes

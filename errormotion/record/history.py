@@ -220,50 +220,54 @@ def _remarks(model: Model) -> list[str]:
 
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema, one sentence each."""
-    found = [f"attribute '{name}': missing" for name in ("machine", "figure", "unit", "start") if name not in ds.attrs]
+    messages = [
+        f"attribute '{name}': missing" for name in ("machine", "figure", "unit", "start") if name not in ds.attrs
+    ]
     if "unit" in ds.attrs and ds.attrs["unit"] not in UNITS:
-        found.append(f"attribute 'unit': expected one of {', '.join(UNITS)}; found '{ds.attrs['unit']}'")
+        messages.append(f"attribute 'unit': expected one of {', '.join(UNITS)}; found '{ds.attrs['unit']}'")
     if "start" in ds.attrs and instant(str(ds.attrs["start"])) is None:
-        found.append(
+        messages.append(
             f"attribute 'start': expected a time such as 2026-03-31T08:00:00+00:00; found {ds.attrs['start']!r}"
         )
     if "run" not in ds.coords:
-        found.append("run: missing; expected the names of the runs")
+        messages.append("run: missing; expected the names of the runs")
     for name, (dims, unit, meaning) in TABLE.items():
         if name not in ds.variables and name in OPTIONAL:
             continue
         if name not in ds.variables:
-            found.append(f"{name}: missing; expected {meaning}")
+            messages.append(f"{name}: missing; expected {meaning}")
             continue
         variable = ds.variables[name]
         if variable.dims != dims:
-            found.append(f"{name}: expected dims ({', '.join(dims)}); found ({', '.join(map(str, variable.dims))})")
+            messages.append(f"{name}: expected dims ({', '.join(dims)}); found ({', '.join(map(str, variable.dims))})")
         elif variable.size and variable.dtype.kind not in ("UO" if unit == "text" else "fiu"):
-            found.append(f"{name}: expected {'text' if unit == 'text' else 'numbers'}; found {variable.dtype}")
-    return found or _wrong_values(ds)
+            messages.append(f"{name}: expected {'text' if unit == 'text' else 'numbers'}; found {variable.dtype}")
+    return messages or _wrong_values(ds)
 
 
 def _wrong_values(ds: xr.Dataset) -> list[str]:
-    found = []
+    messages = []
     known = ("time", "value", "expanded_uncertainty", "influence", "outside", "departing", "event_time", "step_size")
-    found += [f"{name}: expected known numbers; found NaN" for name in known if not np.isfinite(ds[name].values).all()]
+    messages += [
+        f"{name}: expected known numbers; found NaN" for name in known if not np.isfinite(ds[name].values).all()
+    ]
     if not ds.sizes["run"]:
-        found.append("run: expected at least one run; found none")
+        messages.append("run: expected at least one run; found none")
     if (np.diff(ds["time"].values) < 0).any():
-        found.append("time: expected the oldest run first; found a time before the one of the previous run")
+        messages.append("time: expected the oldest run first; found a time before the one of the previous run")
     if (ds["expanded_uncertainty"].values <= 0).any():
-        found.append("expanded_uncertainty: expected values above 0")
+        messages.append("expanded_uncertainty: expected values above 0")
     if (ds["lower_limit"].values > ds["upper_limit"].values).any():
-        found.append("lower_limit: expected values up to 'upper_limit'")
+        messages.append("lower_limit: expected values up to 'upper_limit'")
     for name in ("step_p", "chi2_p"):
         if ((ds[name].values < 0) | (ds[name].values > 1)).any():
-            found.append(f"{name}: expected probabilities from 0 to 1")
+            messages.append(f"{name}: expected probabilities from 0 to 1")
     low, middle, high = (ds[f"step_{name}"].values for name in ("low", "time", "high"))
     if not ((low <= middle) & (middle <= high)).all():
-        found.append("step_time: expected times between 'step_low' and 'step_high'")
+        messages.append("step_time: expected times between 'step_low' and 'step_high'")
     if float(ds["trend_low"]) > float(ds["trend_high"]):
-        found.append("trend_low: expected a value up to 'trend_high'")
+        messages.append("trend_low: expected a value up to 'trend_high'")
     shared = (ds["influence"].values ** 2).sum(axis=0)
     if (4 * shared > ds["expanded_uncertainty"].values ** 2 * (1 + 1e-9)).any():
-        found.append("influence: expected shared sources up to the stated uncertainty")
-    return found
+        messages.append("influence: expected shared sources up to the stated uncertainty")
+    return messages

@@ -112,30 +112,30 @@ def model_of(series: Series) -> Model:
     base = _base(series)
     if base.shape[1] < 2:
         return Model(None)
-    found = _search(series, base)
-    X = _design(base, found)
+    chosen = _search(series, base)
+    X = _design(base, chosen)
     result = fit_runs(X, series.value, series.covariance, series.time)
     if result is None:
         return Model(None)
     V = series.covariance + result.tau**2 * correlation(series.time, series.size, result.duration)
     steps, departing = list[Step](), list[int]()
-    for number, each in enumerate(found):
+    for number, each in enumerate(chosen):
         if each.single:
             departing.append(each.index)
             continue
         column = base.shape[1] + number
-        first, last = _interval(series, base, found, number, V)
+        first, last = _interval(series, base, chosen, number, V)
         size, half_width = float(result.parameters[column]), float(result.half_width[column])
         steps.append(Step(each.index, first, last, size, half_width, each.p))
-    trend = _trend(series, base, found, result)
+    trend = _trend(series, base, chosen, result)
     return Model(result, tuple(sorted(steps, key=lambda step: step.index)), tuple(sorted(departing)), trend)
 
 
-def _trend(series: Series, base: Array, found: list[Candidate], result: RunFit) -> tuple[float, float, float]:
+def _trend(series: Series, base: Array, chosen: list[Candidate], result: RunFit) -> tuple[float, float, float]:
     """Return the trend with its interval, which covers that of the model without uncertain candidates."""
     fits = [result]
-    certain = [each for each in found if each.p <= CERTAIN]
-    if len(certain) < len(found) and (
+    certain = [each for each in chosen if each.p <= CERTAIN]
+    if len(certain) < len(chosen) and (
         without := fit_runs(_design(base, certain), series.value, series.covariance, series.time)
     ):
         fits.append(without)
@@ -152,30 +152,30 @@ def _base(series: Series) -> Array:
     return np.column_stack([np.ones_like(t), t])
 
 
-def _design(base: Array, found: list[Candidate]) -> Array:
-    return np.column_stack([base, *(each.column(len(base)) for each in found)])
+def _design(base: Array, chosen: list[Candidate]) -> Array:
+    return np.column_stack([base, *(each.column(len(base)) for each in chosen)])
 
 
 def _search(series: Series, base: Array) -> list[Candidate]:
-    found: list[Candidate] = []
+    chosen: list[Candidate] = []
     noise = np.random.default_rng(20260301).normal(size=(SIMULATIONS, series.size))
-    while len(found) < MAX_FOUND:
-        X = _design(base, found)
-        candidates = _candidates(series, found)
+    while len(chosen) < MAX_FOUND:
+        X = _design(base, chosen)
+        candidates = _candidates(series, chosen)
         if not candidates or series.size - X.shape[1] < 2:
             break
         best = _Trial(series, X, candidates).significant(noise)
         if best is None:
             break
-        found = _repositioned(series, base, [*found, best])
-    return found
+        chosen = _repositioned(series, base, [*chosen, best])
+    return chosen
 
 
-def _candidates(series: Series, found: list[Candidate], single: bool | None = None) -> list[Candidate]:
+def _candidates(series: Series, chosen: list[Candidate], single: bool | None = None) -> list[Candidate]:
     """Return the candidates for a model; ``single`` restricts them to outliers (True) or steps (False)."""
     n, t = series.size, series.time
-    steps = [each.index for each in found if not each.single]
-    taken = {each.index for each in found if each.single}
+    steps = [each.index for each in chosen if not each.single]
+    taken = {each.index for each in chosen if each.single}
     made = []
     if single is not True:
         made += [
@@ -188,19 +188,19 @@ def _candidates(series: Series, found: list[Candidate], single: bool | None = No
     return made
 
 
-def _repositioned(series: Series, base: Array, found: list[Candidate]) -> list[Candidate]:
+def _repositioned(series: Series, base: Array, chosen: list[Candidate]) -> list[Candidate]:
     """Return candidates at their best positions, each optimised with the others fixed, in at most five passes."""
     for _ in range(5):
-        before = list(found)
-        for number, each in enumerate(found):
-            others = found[:number] + found[number + 1 :]
+        before = list(chosen)
+        for number, each in enumerate(chosen):
+            others = chosen[:number] + chosen[number + 1 :]
             candidates = _candidates(series, others, each.single)
             trial = _Trial(series, _design(base, others), candidates) if candidates else None
             if trial is not None and trial.candidates:
-                found[number] = replace(trial.best(), p=each.p)
-        if found == before:
+                chosen[number] = replace(trial.best(), p=each.p)
+        if chosen == before:
             break
-    return found
+    return chosen
 
 
 class _Trial:
@@ -267,8 +267,8 @@ class _Trial:
             log = metric.log_likelihood(values)
             without = np.maximum(without, log)
             with_them = np.maximum(with_them, log[:, None] + metric.gains(values, self._index, self._single))
-        found: Array = with_them - without[:, None]
-        return found
+        decrease: Array = with_them - without[:, None]
+        return decrease
 
 
 class _Metric:
@@ -293,8 +293,8 @@ class _Metric:
 
     def squares(self, y: Array) -> Array:
         """Return the contributions of the candidates to the sum of squares of values (n,)."""
-        found: Array = (self._inverse @ y @ self._G) ** 2
-        return found
+        squares: Array = (self._inverse @ y @ self._G) ** 2
+        return squares
 
     def _rest(self, values: Array) -> tuple[Array, Array]:
         """Return whitened values (m, n), and their residuals."""
@@ -321,16 +321,16 @@ class _Metric:
         freedom = white.shape[1] - self._Q.shape[1] - 1
         square = ((rest**2).sum(axis=1, keepdims=True) - gain) / freedom
         ratio = 0.5 * gain * (1 / np.maximum(np.pi / 4 * scale**2, 1e-12) + 1 / np.maximum(square, 1e-12))
-        found: Array = 0.5 * values.shape[1] * np.log1p(ratio / freedom)
-        return found
+        gains: Array = 0.5 * values.shape[1] * np.log1p(ratio / freedom)
+        return gains
 
 
-def _interval(series: Series, base: Array, found: list[Candidate], number: int, V: Array) -> tuple[int, int]:
+def _interval(series: Series, base: Array, chosen: list[Candidate], number: int, V: Array) -> tuple[int, int]:
     """Return the last value before the interval of a step, and the last value within it."""
-    others = found[:number] + found[number + 1 :]
+    others = chosen[:number] + chosen[number + 1 :]
     trial = _Trial(series, _design(base, others), _candidates(series, others, single=False), V)
     if not trial.candidates:
-        return found[number].index - 1, found[number].index
+        return chosen[number].index - 1, chosen[number].index
     gain = trial.squares()
     inside = [c.index for c, each in zip(trial.candidates, gain, strict=True) if each >= gain.max() - LIKELIHOOD_DROP]
     return min(inside) - 1, max(inside)

@@ -55,47 +55,47 @@ def trend_text(ds: xr.Dataset) -> str:
 def sentences(ds: xr.Dataset) -> list[str]:
     """Return the results of a history as sentences, the most important first."""
     factor, unit = field_of(ds)
-    found = []
+    texts = []
     for k in range(ds.sizes["step"]):
         size = sized(ds, float(ds["step_size"][k]), float(ds["step_half_width"][k]))
         text = str(ds["step_event"].values[k])
         low, likely, high = (date(ds, float(ds[f"step_{name}"][k])) for name in ("low", "time", "high"))
         named = f", noted: {text}" if text else ", no note"
         p = float(ds["step_p"][k])
-        found.append(f"Step of {size} about {likely} (between {low} and {high}, p = {p:.2g}){named}.")
-    if not found:
-        found.append(
+        texts.append(f"Step of {size} about {likely} (between {low} and {high}, p = {p:.2g}){named}.")
+    if not texts:
+        texts.append(
             "No significant step, with a probability of a false alarm of "
             f"{100 * float(ds.attrs['false_alarms']):.2g} %."
         )
     for k, before, after in version_changes(ds):
         when = date(ds, float(ds["time"][k]))
-        found.append(
+        texts.append(
             f"From {when} on, {before} is replaced by {after}: values before and after may differ by definition."
         )
     sure = float(ds["trend_low"]) > 0 or float(ds["trend_high"]) < 0
-    found.append(f"Trend: {trend_text(ds)}{'.' if not np.isfinite(ds['trend']) or sure else ': not significant.'}")
+    texts.append(f"Trend: {trend_text(ds)}{'.' if not np.isfinite(ds['trend']) or sure else ': not significant.'}")
     names = ds["run"].values
     departing = [str(name) for name, each in zip(names, ds["departing"].values, strict=True) if each]
     if departing:
-        found.append(f"Outliers, which are left out of the centre of the chart: {', '.join(departing)}.")
+        texts.append(f"Outliers, which are left out of the centre of the chart: {', '.join(departing)}.")
     outside = [str(name) for name, each in zip(names, ds["outside"].values, strict=True) if each]
     shown = ", ".join(outside[:5]) + (f" and {len(outside) - 5} more" if len(outside) > 5 else "")
-    found.append(f"Outside the control limits: {shown}." if outside else "All values are within the control limits.")
+    texts.append(f"Outside the control limits: {shown}." if outside else "All values are within the control limits.")
     tau = float(ds["reproducibility"])
     if np.isfinite(tau):
         own = float(np.median(ds["expanded_uncertainty"].values)) / 2
         tau_text, own_text = rounded(factor * tau, factor * max(tau, own) / 10, signed=False)[0], factor * own
-        found.append(
+        texts.append(
             f"Reproducibility of machine and set-up (Paule and Mandel): standard deviation {tau_text} {unit}".rstrip()
             + f", in addition to the stated standard uncertainty of the runs, {own_text:.2g} {unit}".rstrip()
             + " (median)."
         )
     if "duration" in ds.variables and float(ds["duration"]) > 0:
-        found.append(
+        texts.append(
             f"Neighbouring runs are alike over about {float(ds['duration']) / 86400:.2g} days: the intervals of trend "
             "and steps contain it."
         )
     if count := ds.sizes["source"]:
-        found.append(f"Sources that several runs share, treated as fully correlated: {count}.")
-    return found
+        texts.append(f"Sources that several runs share, treated as fully correlated: {count}.")
+    return texts

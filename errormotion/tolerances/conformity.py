@@ -102,11 +102,11 @@ class Conformity:
         counts = [(sum(row.decision == each for row in self.rows), words[each]) for each in (OUTSIDE, OPEN, INSIDE)]
         parts = ", ".join(f"{count} {word}" for count, word in counts if count)
         head = f"Tolerances: {self.verdict} ({self.tolerances.guard_text()})"
-        found = [f"{head}; of {len(self.rows)} limits: {parts}." if parts else f"{head}."]
+        lines = [f"{head}; of {len(self.rows)} limits: {parts}." if parts else f"{head}."]
         if self.failure:
-            found.append(f"The figures of merit could not be computed: {self.failure}")
+            lines.append(f"The figures of merit could not be computed: {self.failure}")
         order = {OUTSIDE: 0, OPEN: 1, INSIDE: 2}
-        return found + [
+        return lines + [
             _line(row, words[row.decision]) for row in sorted(self.rows, key=lambda row: order[row.decision])
         ]
 
@@ -150,9 +150,9 @@ def judge_figures(figures: Sequence[FigureOfMerit], tolerances: Tolerances) -> C
     """Decide on figures of merit only; limits of freedoms are not used."""
     rows, unused = list[Row](), list[str]()
     for pattern, limit in tolerances.figures.items():
-        found = [figure for figure in figures if matches(pattern, figure.name)]
-        rows += [_of_figure(figure, limit, tolerances) for figure in found]
-        unused += [] if found else [pattern]
+        matching = [figure for figure in figures if matches(pattern, figure.name)]
+        rows += [_of_figure(figure, limit, tolerances) for figure in matching]
+        unused += [] if matching else [pattern]
     return Conformity(tuple(rows), (*unused, *tolerances.freedoms), tolerances)
 
 
@@ -166,10 +166,10 @@ def matches(pattern: str, name: str) -> bool:
         return False
     position, end = len(first), len(name) - len(last)
     for part in rest:
-        found = name.find(part, position, end)
-        if found < 0:
+        at = name.find(part, position, end)
+        if at < 0:
             return False
-        position = found + len(part)
+        position = at + len(part)
     return True
 
 

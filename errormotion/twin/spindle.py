@@ -80,31 +80,31 @@ class Spindle:
 
     def synchronous(self, angle: Array) -> Array:
         """Return the error motion that repeats in every turn, without eccentricity, (n, 6)."""
-        found = np.zeros((angle.size, 6))
+        motion = np.zeros((angle.size, 6))
         for name, harmonics in self.harmonics.items():
             at = ("EX", "EY", "EZ", "EA", "EB", "EC").index(name)
             for k, (amplitude, phase) in harmonics.items():
-                found[:, at] += amplitude * np.cos(k * angle + phase)
-        return found
+                motion[:, at] += amplitude * np.cos(k * angle + phase)
+        return motion
 
     def other(self, angle: Array, generator: np.random.Generator) -> Array:
         """Return the error motion that does not repeat, (n, 6)."""
-        n, found = angle.size, np.zeros((angle.size, 6))
+        n, motion = angle.size, np.zeros((angle.size, 6))
         share = sum(a**2 for _, a in self.bearing)
         for k in range(5):
             for order, amplitude in self.bearing:
-                found[:, k] += np.sqrt(2) * amplitude * np.cos(order * angle + generator.uniform(0, TAU))
+                motion[:, k] += np.sqrt(2) * amplitude * np.cos(order * angle + generator.uniform(0, TAU))
             w = generator.standard_normal(n) * np.sqrt(max(1 - share, 0.0))
             w[1:] *= np.sqrt(1 - self.correlation**2)
-            found[:, k] += lfilter([1.0], [1.0, -self.correlation], w)
-        return np.asarray(found * self.asynchronous * np.array([1, 1, 1, 1 / self.lever, 1 / self.lever, 0]))
+            motion[:, k] += lfilter([1.0], [1.0, -self.correlation], w)
+        return np.asarray(motion * self.asynchronous * np.array([1, 1, 1, 1 / self.lever, 1 / self.lever, 0]))
 
     def set_up(self, angle: Array) -> Array:
         """Return the motion of the artefact by its eccentricity and tilt, (n, 6)."""
-        found, turn = np.zeros((angle.size, 6)), np.exp(1j * angle)
+        motion, turn = np.zeros((angle.size, 6)), np.exp(1j * angle)
         for at, size in ((0, self.eccentricity), (3, self.tilt)):
-            found[:, at], found[:, at + 1] = (size * turn).real, (size * turn).imag
-        return found
+            motion[:, at], motion[:, at + 1] = (size * turn).real, (size * turn).imag
+        return motion
 
 
 def displacements(
@@ -130,11 +130,11 @@ def displacements(
     form : tuple of ndarray, (h,), (sensor, h), (sensor, h)
         Undulations, and their cosines and sines of the form at each sensor, outward, m.
     """
-    found = np.empty((len(direction), angle.size))
+    result = np.empty((len(direction), angle.size))
     for k, (n, p) in enumerate(zip(direction, position, strict=True)):
         d = motion[:, :3] + np.cross(motion[:, 3:], p)
         if abs(n[2]) > 0.5:
-            found[k] = d @ n
+            result[k] = d @ n
             continue
         o = np.array([p[0], p[1], 0.0]) / np.hypot(p[0], p[1])
         b = d @ np.array([-o[1], o[0], 0.0])
@@ -143,5 +143,5 @@ def displacements(
             undulations, cosine, sine = form
             phase = np.multiply.outer(np.arctan2(o[1], o[0]) - angle, undulations)
             surface = surface + np.cos(phase) @ cosine[k] + np.sin(phase) @ sine[k]
-        found[k] = (n @ o) * surface + (d @ (n - (n @ o) * o))
-    return found
+        result[k] = (n @ o) * surface + (d @ (n - (n @ o) * o))
+    return result

@@ -87,8 +87,8 @@ def dim_of(folder: RunFolder) -> str:
     if "campaign" not in folder.data:
         return "time"
     tests = stored_plan(folder).tests
-    found = next((test for test in tests if test.name == folder.data.get("test")), None)
-    return found.method().append_dim(found.settings) if found is not None else "time"
+    test_found = next((test for test in tests if test.name == folder.data.get("test")), None)
+    return test_found.method().append_dim(test_found.settings) if test_found is not None else "time"
 
 
 def _last(raw: xr.Dataset, dim: str, count: int) -> Iterator[Value]:
@@ -105,11 +105,11 @@ def _last(raw: xr.Dataset, dim: str, count: int) -> Iterator[Value]:
 
 def _label(raw: xr.Dataset, dim: str, index: int) -> str:
     if dim in raw.coords and raw[dim].ndim == 1:
-        found = raw[dim].values[index]
-        if isinstance(found, str):
-            return str(found)
-        if np.isreal(found):
+        value = raw[dim].values[index]
+        if isinstance(value, str):
+            return str(value)
+        if np.isreal(value):
             values, unit = in_field_units(raw[dim])
             return f"{dim} {values[index]:g} {unit}".removesuffix(" 1")
-        return str(found)
+        return str(value)
     return f"{dim} {index + 1}"

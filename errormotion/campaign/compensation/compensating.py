@@ -167,9 +167,9 @@ class Compensation:
     def _check_inputs(self) -> None:
         absent = [name for name in self._predictor.temperatures if name not in self._monitor.sensors]
         if absent:
-            found = ", ".join(self._monitor.sensors) or "none"
+            names = ", ".join(self._monitor.sensors) or "none"
             raise BenchError(
-                f"{self.plan.source}: the model needs the temperatures {', '.join(absent)}; found {found}",
+                f"{self.plan.source}: the model needs the temperatures {', '.join(absent)}; found {names}",
                 code="bench.temperatures.missing",
             )
         if (needed := self._predictor.parameters) and self._monitor.controller is None:
@@ -344,23 +344,23 @@ class Compensation:
             return None, "", ""
         try:
             self._output.open()
-            found = self._output.read()
+            applied = self._output.read()
         except InstrumentError as error:
             self._lost, self._regained = True, 0
             return None, "", f"no answer: {cause_of(error)}" if self.armed else ""
-        offset = (float(found.offset[0]), float(found.offset[1]), float(found.offset[2]))
-        if not self.armed or found.fault:
-            return offset, found.busy, found.fault if self.armed else ""
+        offset = (float(applied.offset[0]), float(applied.offset[1]), float(applied.offset[2]))
+        if not self.armed or applied.fault:
+            return offset, applied.busy, applied.fault if self.armed else ""
         if self.state in (State.OFF, State.FAULT) or self._lost:
-            return offset, found.busy, ""
+            return offset, applied.busy, ""
         allowed = AGREEMENT * self.limits.slew * self.limits.period
         if not (np.abs(self._follower.offset - offset) <= allowed).all():
             return (
                 offset,
-                found.busy,
+                applied.busy,
                 "the offset of the machine is not the written one: another program wrote it, or the machine stopped",
             )
-        return offset, found.busy, ""
+        return offset, applied.busy, ""
 
     def _rejoin(self, applied: tuple[float, float, float] | None) -> None:
         """After a lost connection, continue from the present offset of the machine; other faults need the operator."""

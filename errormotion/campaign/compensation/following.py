@@ -163,8 +163,10 @@ def is_working(folder: Path) -> bool:
 def compensations(runs: Path) -> Iterator[Path]:
     """Yield the run folders of compensations in a folder of runs, the newest first."""
     if runs.is_dir():
-        found = sorted((path.parent for path in visible(runs, f"*/{AUDIT}")), key=lambda path: path.name, reverse=True)
-        yield from found[:MAX_COMPENSATIONS]
+        folders = sorted(
+            (path.parent for path in visible(runs, f"*/{AUDIT}")), key=lambda path: path.name, reverse=True
+        )
+        yield from folders[:MAX_COMPENSATIONS]
 
 
 def request_stop(folder: Path) -> None:

@@ -117,12 +117,12 @@ def with_field(text: str, place: Sequence[Key], written: str) -> str:
     """
     data = parse_toml(text, "text")
     known = {each.place: each for _, _, fields in _groups(data) for each in fields}
-    found = known.get(tuple(place))
-    if found is None:
+    field = known.get(tuple(place))
+    if field is None:
         raise DatasetError(f"{dotted(place)}: no such field", code="form.field.unknown")
-    if written.strip() == "" and not (found.required and found.plain):
+    if written.strip() == "" and not (field.required and field.plain):
         return with_value(text, place, None)
-    return with_value(text, place, written if found.plain else value_of(written.strip()))
+    return with_value(text, place, written if field.plain else value_of(written.strip()))
 
 
 def with_test(text: str) -> str:
@@ -238,8 +238,8 @@ def _choices(options: Sequence[Any]) -> tuple[str, ...]:
     if options == [bool]:
         return ("true", "false")
     if options and all(get_origin(option) is Literal for option in options):
-        found = tuple(each for option in options for each in get_args(option))
-        return found if all(isinstance(each, str) for each in found) else ()
+        choices = tuple(each for option in options for each in get_args(option))
+        return choices if all(isinstance(each, str) for each in choices) else ()
     return ()
 
 

@@ -58,12 +58,12 @@ def _written(value: float, quantity: Quantity) -> str:
 
 def quantity_of(field: FieldInfo) -> Quantity | None:
     """Return the quantity of a setting, or that of its elements."""
-    found = [note for note in field.metadata if isinstance(note, Quantity)]
+    quantities = [note for note in field.metadata if isinstance(note, Quantity)]
     pending = [field.annotation]
-    while pending and not found:
+    while pending and not quantities:
         each = pending.pop()
         if isinstance(each, type) and issubclass(each, BaseModel):
             continue
-        found += [note for note in getattr(each, "__metadata__", ()) if isinstance(note, Quantity)]
+        quantities += [note for note in getattr(each, "__metadata__", ()) if isinstance(note, Quantity)]
         pending += [argument for argument in get_args(each) if argument is not Ellipsis]
-    return found[0] if found else None
+    return quantities[0] if quantities else None

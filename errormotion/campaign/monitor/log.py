@@ -203,16 +203,16 @@ def figures(dataset: xr.Dataset) -> list[FigureOfMerit]:
     The uncertainty of the temperatures is not part of a log: U is NaN.
     """
     log = read_log(dataset)
-    found = [FigureOfMerit("duration", log.duration, math.nan, "s")]
+    merits = [FigureOfMerit("duration", log.duration, math.nan, "s")]
     known = [channel for channel in log.temperatures if channel.known]
     if known:
         most = max(known, key=lambda channel: abs(channel.last - channel.first))
         highest = max(known, key=lambda channel: channel.high)
-        found.append(FigureOfMerit(f"temperature change of {most.name}", most.last - most.first, math.nan, "K"))
-        found.append(FigureOfMerit(f"highest temperature of {highest.name}", highest.high, math.nan, "degC"))
+        merits.append(FigureOfMerit(f"temperature change of {most.name}", most.last - most.first, math.nan, "K"))
+        merits.append(FigureOfMerit(f"highest temperature of {highest.name}", highest.high, math.nan, "degC"))
     gaps = {name: sum(gap.rows for gap in gaps) for name, gaps in log.gaps.items()}
-    found += [FigureOfMerit(f"rows without a reading of {name}", float(rows), 0.0, "1") for name, rows in gaps.items()]
-    return found
+    merits += [FigureOfMerit(f"rows without a reading of {name}", float(rows), 0.0, "1") for name, rows in gaps.items()]
+    return merits
 
 
 def _edges(time: Array, whole: bool) -> Array:
@@ -249,10 +249,10 @@ def _names(dataset: xr.Dataset, dim: str) -> list[str]:
 def _meanings(dataset: xr.Dataset) -> list[str]:
     """Return the meanings of the numbers of ``temperature_flag``."""
     try:
-        found = json.loads(str(dataset.attrs.get("flag_meanings", "[]")))
+        meanings = json.loads(str(dataset.attrs.get("flag_meanings", "[]")))
     except (ValueError, RecursionError):
-        found = []
-    return [str(word) for word in found] if isinstance(found, list) and found else ["known", "unknown"]
+        meanings = []
+    return [str(word) for word in meanings] if isinstance(meanings, list) and meanings else ["known", "unknown"]
 
 
 def _interval(dataset: xr.Dataset, time: Array) -> float:

@@ -41,14 +41,14 @@ def texts(language: str) -> dict[str, str]:
 def chapters(source: Source) -> list[Part]:
     """Return the chapter of a log."""
     log, key = read_log(source.errors), source.key
-    found = _sensors(log, source)
+    shown = _sensors(log, source)
     chapter = Part(
         "Log of a monitor",
-        _key_figures(log, found),
-        _summary(log, found),
+        _key_figures(log, shown),
+        _summary(log, shown),
         [
             Section("log", "Temperatures and working parameters", [*_over_time(log, f"{key}-log"), *_numbers(log)]),
-            Section("sensors", "Temperature sensors", sensors.blocks(found, f"{key}-sensors")),
+            Section("sensors", "Temperature sensors", sensors.blocks(shown, f"{key}-sensors")),
             Section("gaps", "Gaps", _gaps(log)),
             Section("provenance", "Provenance", provenance.blocks(source)),
         ],
@@ -70,10 +70,10 @@ def duration(seconds: float) -> str:
 
 def _sensors(log: Log, source: Source) -> list[sensors.Sensor]:
     where = sensors.places(source)
-    found = []
+    shown = []
     for channel, place, why in zip(log.temperatures, log.place, log.why, strict=True):
         reasons = listed([f"{reason} in {integer(count)} rows" for reason, count in why.items()])
-        found.append(
+        shown.append(
             sensors.Sensor(
                 channel.name,
                 place if np.isfinite(place).all() else where.get(channel.name, place),
@@ -86,13 +86,13 @@ def _sensors(log: Log, source: Source) -> list[sensors.Sensor]:
                 reasons,
             )
         )
-    return found
+    return shown
 
 
-def _key_figures(log: Log, found: Sequence[sensors.Sensor]) -> list[KeyFigure]:
+def _key_figures(log: Log, shown: Sequence[sensors.Sensor]) -> list[KeyFigure]:
     length, unit = duration(log.duration).rsplit(" ", 1)
     figures = [KeyFigure("duration", Cell(length), unit, f"{integer(log.rows)} rows")]
-    known = [sensor for sensor in found if math.isfinite(sensor.change)]
+    known = [sensor for sensor in shown if math.isfinite(sensor.change)]
     if known:
         most = max(known, key=lambda sensor: abs(sensor.change))
         figures.append(KeyFigure("largest change", Cell(fixed(most.change, 1, signed=True)), "K", most.name))
@@ -107,10 +107,10 @@ def _key_figures(log: Log, found: Sequence[sensors.Sensor]) -> list[KeyFigure]:
     return figures
 
 
-def _summary(log: Log, found: list[sensors.Sensor]) -> list[str]:
+def _summary(log: Log, shown: list[sensors.Sensor]) -> list[str]:
     words = [f"{integer(log.rows)} rows over {duration(log.duration)}, one every {duration(log.interval)}."]
-    if found:
-        words.append(sensors.warmest(found))
+    if shown:
+        words.append(sensors.warmest(shown))
     silent = [name for name, gaps in log.gaps.items() if gaps]
     if silent:
         counts = listed([f"{name} ({integer(len(log.gaps[name]))})" for name in silent])

@@ -130,9 +130,9 @@ class Monitor:
         self.sources = [Source(each, self.interval, self._clock) for each in instruments]
         controllers = [source for source in self.sources if _kind(source) == "controller"]
         if not self.sources or len(controllers) > 1:
-            found = ", ".join(source.name for source in controllers) or ", ".join(plan.kinds)
+            names = ", ".join(source.name for source in controllers) or ", ".join(plan.kinds)
             wanted = "thermometers, a controller, or both" if not self.sources else "one controller at most"
-            raise BenchError(f"{plan.source}: expected {wanted}; found {found}", code="monitor.quantities.missing")
+            raise BenchError(f"{plan.source}: expected {wanted}; found {names}", code="monitor.quantities.missing")
         self.controller = controllers[0] if controllers else None
         self._columns = _columns([source for source in self.sources if source is not self.controller])
         self.sensors = tuple(self._columns.values())
@@ -270,16 +270,16 @@ class Monitor:
     def _doubt(self, new: Mapping[str, float]) -> dict[str, str]:
         """Return the temperatures whose sensors no longer measure; log each change."""
         self._liveness.put(new)
-        found = self._liveness.found()
-        for name in found.keys() - self._doubtful.keys():
-            log.warning("%s %s", name, found[name])
+        doubts = self._liveness.found()
+        for name in doubts.keys() - self._doubtful.keys():
+            log.warning("%s %s", name, doubts[name])
             if name not in self.doubted:
-                self.doubted[name] = found[name]
-                self.folder.step("readings", "doubtful", sensor=name, reason=found[name])
-        for name in self._doubtful.keys() - found.keys():
+                self.doubted[name] = doubts[name]
+                self.folder.step("readings", "doubtful", sensor=name, reason=doubts[name])
+        for name in self._doubtful.keys() - doubts.keys():
             log.info("%s measures again", name)
-        self._doubtful = found
-        return dict(found)
+        self._doubtful = doubts
+        return dict(doubts)
 
     def _row(self, snapshot: Snapshot) -> xr.Dataset:
         gap = np.array([[source.name in snapshot.silent for source in self.sources]], dtype=np.int8)

@@ -17,18 +17,18 @@ def planned(plan: CampaignPlan, test: TestPlan) -> xr.Dataset:
     method, settings = test.method(), test.settings
     with looking_beside(plan.folder):
         settings = method.planning_settings(settings, plan.bench.chosen(test.instruments).settings_by_kind)
-        found: xr.Dataset = method.plan(settings)
-    return found
+        result: xr.Dataset = method.plan(settings)
+    return result
 
 
 def expected(errors: xr.Dataset) -> list[dict[str, Any]]:
     """Return the largest expanded uncertainty (k = 2) of every freedom in a planned error dataset."""
     variances = np.diagonal(errors.em.covariance().values, axis1=-2, axis2=-1)
-    found = []
+    parts = []
     for k, name in enumerate(errors.em.names):
         seen = variances[..., k][np.isfinite(variances[..., k])]
         if seen.size:
             factor, unit = FIELD_UNITS[errors[name].attrs["units"]]
             largest = 2.0 * float(np.sqrt(seen.max())) * factor
-            found.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
-    return found
+            parts.append({"name": name, "expanded_uncertainty": largest, "unit": unit})
+    return parts

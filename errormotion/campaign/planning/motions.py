@@ -54,21 +54,21 @@ def headline(found: Motions) -> str:
     return f"{duration(own.seconds)}{untimed}, {own.moves} moves over {own.path:.1f} m, {own.touches} touches"
 
 
-def beside_limits(found: Extent, limits: Limits) -> list[list[str]]:
+def beside_limits(reached: Extent, limits: Limits) -> list[list[str]]:
     """Return rows of quantity, planned value and limits, as text."""
     rows = []
     for k, axis in enumerate(AXES):
         span = getattr(limits, axis)
         bounds = "-" if span is None else f"{span[0] * MM:.1f} to {span[1] * MM:.1f}"
-        known = not math.isnan(found.low[k])
-        planned = f"{found.low[k] * MM:.1f} to {found.high[k] * MM:.1f}" if known else "stays"
+        known = not math.isnan(reached.low[k])
+        planned = f"{reached.low[k] * MM:.1f} to {reached.high[k] * MM:.1f}" if known else "stays"
         rows.append([f"{axis}/mm", planned, bounds])
     feed = "-" if limits.feed is None else f"{limits.feed * MM * MINUTE:.0f}"
     speed = "-" if limits.spindle_speed is None else f"{limits.spindle_speed:.0f}"
-    rapid = f"rapid in {found.rapid} moves" if found.rapid else ""
-    stated = f"up to {found.feed * MM * MINUTE:.0f}" if found.feed or not rapid else ""
+    rapid = f"rapid in {reached.rapid} moves" if reached.rapid else ""
+    stated = f"up to {reached.feed * MM * MINUTE:.0f}" if reached.feed or not rapid else ""
     rows.append(["feed/(mm/min)", ", ".join(filter(None, [stated, rapid])), feed])
-    rows.append(["spindle/(1/min)", f"up to {found.spindle_speed:.0f}", speed])
+    rows.append(["spindle/(1/min)", f"up to {reached.spindle_speed:.0f}", speed])
     return rows
 
 

@@ -33,10 +33,10 @@ def require_ready(
     BenchError
         At least one test cannot be measured; the message states every cause.
     """
-    found = [f"test '{test.name}': {text}" for test in tests for text in _obstacles(plan, test)]
+    obstacles = [f"test '{test.name}': {text}" for test in tests for text in _obstacles(plan, test)]
     interrupted = ((test.name, cannot_continue(test)) for test in tests if test.name in begun)
-    found += [f"test '{name}': {text}" for name, text in interrupted if text]
-    if not found:
+    obstacles += [f"test '{name}': {text}" for name, text in interrupted if text]
+    if not obstacles:
         return
     what = f"{plan.source}: with this bench the campaign cannot be measured. Nothing was opened, nothing was created"
     if stored:
@@ -44,7 +44,7 @@ def require_ready(
             ". It would be continued with the files of its start, which are in the run folder: correct the bench, and "
             "start a new run without --resume"
         )
-    raise BenchError("\n  - ".join([f"{what}:", *found]), code="bench.not_ready")
+    raise BenchError("\n  - ".join([f"{what}:", *obstacles]), code="bench.not_ready")
 
 
 def cannot_continue(test: TestPlan) -> str:
@@ -78,17 +78,17 @@ def accept_overdue(
     BenchError
         There is nobody to ask.
     """
-    found = overdue(plan, tests, today)
-    if not found:
+    texts = overdue(plan, tests, today)
+    if not texts:
         return
-    for text in found:
+    for text in texts:
         note(f"{text} The report will state that it is overdue.")
     if is_simulated(plan.bench):
         return
-    request = f"{' '.join(found)} Measure nevertheless? The report will state that the calibration is overdue."
+    request = f"{' '.join(texts)} Measure nevertheless? The report will state that the calibration is overdue."
     if ask is None:
         raise BenchError(
-            f"{' '.join(found)} Nothing was opened, nothing was created. Calibrate, and correct [calibrated_until] of "
+            f"{' '.join(texts)} Nothing was opened, nothing was created. Calibrate, and correct [calibrated_until] of "
             f"{plan.bench.source}; or, to measure nevertheless, run the command in a terminal, or with --yes.",
             code="bench.calibration.overdue",
         )
@@ -99,9 +99,9 @@ def _obstacles(plan: CampaignPlan, test: TestPlan) -> list[str]:
     bench = plan.bench.chosen(test.instruments)
     try:
         opened = OpenBench.closed(bench)
-        found = test.method().check_bench(test.settings, opened, tuple(test.inputs))
-        if found is not None:
-            return list(found)
+        obstacles = test.method().check_bench(test.settings, opened, tuple(test.inputs))
+        if obstacles is not None:
+            return list(obstacles)
         if not moves(steps_of(test.method, test.settings, bench.settings_by_kind)):
             return []
     except ErrormotionError as error:

@@ -37,8 +37,8 @@ class ReportTable(BaseModel):
 
 def logo_mistakes(laboratory: Laboratory | None, folder: Path) -> list[str]:
     """Return why the logo of a laboratory cannot be used; empty if it can, or without a logo."""
-    found = logo.mistake(folder / laboratory.logo) if laboratory is not None and laboratory.logo else ""
-    return [f"laboratory.logo: {found}"] if found else []
+    mistake = logo.mistake(folder / laboratory.logo) if laboratory is not None and laboratory.logo else ""
+    return [f"laboratory.logo: {mistake}"] if mistake else []
 
 
 def until_mistakes(until: Mapping[str, date], instruments: Mapping[str, Any]) -> list[str]:
@@ -55,12 +55,12 @@ def stated(
     laboratory: Laboratory | None, report: ReportTable | None, until: Mapping[str, date], certified: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the head of the reports of a campaign for ``run.json``; keys that are not stated are absent."""
-    found: dict[str, Any] = {}
+    attributes: dict[str, Any] = {}
     if laboratory is not None:
-        found |= {"laboratory": laboratory.name, "address": laboratory.address}
-        found["accreditation"] = laboratory.accreditation
-    found |= report.model_dump() if report is not None else {}
+        attributes |= {"laboratory": laboratory.name, "address": laboratory.address}
+        attributes["accreditation"] = laboratory.accreditation
+    attributes |= report.model_dump() if report is not None else {}
     if until:
-        found["calibrated_until"] = {name: day.isoformat() for name, day in until.items()}
-        found["certificates"] = dict(certified)
-    return {key: each for key, each in found.items() if each}
+        attributes["calibrated_until"] = {name: day.isoformat() for name, day in until.items()}
+        attributes["certificates"] = dict(certified)
+    return {key: each for key, each in attributes.items() if each}

@@ -24,13 +24,13 @@ def without_limits(data: Any) -> tuple[Any, list[str]]:
     """Return ``[limits]`` without the axes that a machine may have and that have no limits, and a mistake for each."""
     if not isinstance(data, dict):
         return data, []
-    found = [axis for axis in data if axis in OTHER_AXES]
+    others = [axis for axis in data if axis in OTHER_AXES]
     mistakes = [
         f"limits.{axis}: the axis {axis} has no limits here, since no method and no driver moves it; [limits] can "
         f"state {', '.join(Limits.model_fields)}. State the range of {axis} as machine.travel.{axis}, and remove this"
-        for axis in found
+        for axis in others
     ]
-    return {key: each for key, each in data.items() if key not in found}, mistakes
+    return {key: each for key, each in data.items() if key not in others}, mistakes
 
 
 class Limits(BaseModel):
@@ -113,23 +113,23 @@ def extent(steps: Sequence[Step]) -> Extent:
     )
 
 
-def violations(found: Extent, limits: Limits) -> list[str]:
+def violations(moves: Extent, limits: Limits) -> list[str]:
     """Return every violation of the limits, one sentence each."""
     exceeded = []
     for k, axis in enumerate(AXES):
         span = getattr(limits, axis)
-        if span is None or math.isnan(found.low[k]):
+        if span is None or math.isnan(moves.low[k]):
             continue
-        if found.low[k] < span[0] - _ROUNDING or found.high[k] > span[1] + _ROUNDING:
+        if moves.low[k] < span[0] - _ROUNDING or moves.high[k] > span[1] + _ROUNDING:
             exceeded.append(
-                f"{axis} would move from {_mm(found.low[k])} to {_mm(found.high[k])}; its limits are {_mm(span[0])} "
+                f"{axis} would move from {_mm(moves.low[k])} to {_mm(moves.high[k])}; its limits are {_mm(span[0])} "
                 f"and {_mm(span[1])}"
             )
-    if limits.feed is not None and found.feed > limits.feed * (1 + _ROUNDING):
-        exceeded.append(f"the feed would be {_feed(found.feed)}; its limit is {_feed(limits.feed)}")
-    if limits.spindle_speed is not None and found.spindle_speed > limits.spindle_speed:
+    if limits.feed is not None and moves.feed > limits.feed * (1 + _ROUNDING):
+        exceeded.append(f"the feed would be {_feed(moves.feed)}; its limit is {_feed(limits.feed)}")
+    if limits.spindle_speed is not None and moves.spindle_speed > limits.spindle_speed:
         exceeded.append(
-            f"the spindle would turn at {found.spindle_speed:g} /min; its limit is {limits.spindle_speed:g} /min"
+            f"the spindle would turn at {moves.spindle_speed:g} /min; its limit is {limits.spindle_speed:g} /min"
         )
     return exceeded
 
@@ -180,22 +180,22 @@ def announcement(test: str, steps: Sequence[Step] | None, limits: Limits) -> str
     """Return the motions of a test and their limits in one line; ``steps`` as from `steps_of`."""
     if steps is None:
         return f"{test}: the method states no motions; no command to the machine is allowed."
-    found = extent(steps)
+    reached = extent(steps)
     parts = []
     for k, axis in enumerate(AXES):
-        if not math.isnan(found.low[k]):
-            planned = f"{axis} {_mm(found.low[k])} to {_mm(found.high[k])}"
+        if not math.isnan(reached.low[k]):
+            planned = f"{axis} {_mm(reached.low[k])} to {_mm(reached.high[k])}"
             span = getattr(limits, axis)
             parts.append(f"{planned} ({'no limits' if span is None else f'limits {_mm(span[0])} and {_mm(span[1])}'})")
-    if found.feed:
+    if reached.feed:
         limit = "no limit" if limits.feed is None else f"limit {_feed(limits.feed)}"
-        parts.append(f"feed up to {_feed(found.feed)} ({limit})")
-    if found.rapid:
+        parts.append(f"feed up to {_feed(reached.feed)} ({limit})")
+    if reached.rapid:
         held = "not limited" if limits.feed is None else f"limited to {_feed(limits.feed)}"
-        parts.append(f"rapid moves: {found.rapid} ({held})")
-    if found.spindle_speed:
+        parts.append(f"rapid moves: {reached.rapid} ({held})")
+    if reached.spindle_speed:
         limit = "no limit" if limits.spindle_speed is None else f"limit {limits.spindle_speed:g} /min"
-        parts.append(f"spindle up to {found.spindle_speed:g} /min ({limit})")
+        parts.append(f"spindle up to {reached.spindle_speed:g} /min ({limit})")
     return f"{test}: the machine will move: {', '.join(parts)}." if parts else f"{test}: nothing will move."
 
 

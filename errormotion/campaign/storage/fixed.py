@@ -106,8 +106,8 @@ class Fixed:
         own = {key: value for key, value in chunk.attrs.items() if key not in PER_CHUNK}
         self._check_attrs("the dataset", attrs, own)
 
-    def _check_attrs(self, what: str, before: Mapping[str, Any], found: Mapping[Any, Any]) -> None:
-        for key, value in plain_attrs(found).items():
+    def _check_attrs(self, what: str, before: Mapping[str, Any], after: Mapping[Any, Any]) -> None:
+        for key, value in plain_attrs(after).items():
             if key not in before or not _same(before[key], value):
                 raise RunError(
                     f"{self.path}: the attribute '{key}' of {what} differs from the first dataset: expected "

@@ -323,10 +323,10 @@ class RawStore:
         column = self._arrays[name]
         along = column.dims[column.axis]
         expected = {d: n for d, n in zip(column.dims, column.shape, strict=True) if d != along}
-        found = {str(d): n for d, n in variable.sizes.items() if d != along}
-        if found != expected:
+        sizes = {str(d): n for d, n in variable.sizes.items() if d != along}
+        if sizes != expected:
             raise RunError(
-                f"{self.path}: '{name}' has the sizes {found}; expected {expected}", code="method.data.sizes"
+                f"{self.path}: '{name}' has the sizes {sizes}; expected {expected}", code="method.data.sizes"
             )
         if not (column.packing or fits(variable, column.dtype)):
             raise RunError(
@@ -377,13 +377,13 @@ class RawStore:
 
 def _growing(name: str, of: Sequence[Hashable], dims: Sequence[str]) -> str:
     """Return the growing dimension of a variable; empty if it has none."""
-    found = [dim for dim in dims if dim in of]
-    if len(found) > 1:
+    growing = [dim for dim in dims if dim in of]
+    if len(growing) > 1:
         raise RunError(
             f"expected '{name}' along one of {', '.join(dims)}, which grow independently; found two",
             code="method.data.dim",
         )
-    return found[0] if found else ""
+    return growing[0] if growing else ""
 
 
 def committed_length(path: Path, dim: str) -> int:

@@ -71,13 +71,13 @@ def on_axis(
     axes, _, _ = at_reference(axes, place, notes)
     letter = axis.lower()
     positions = _common_positions(axes, volumes, letter)
-    found: dict[str, Curve] = {}
+    curves: dict[str, Curve] = {}
     for name in datasets:
         if name in axes:
-            found[name] = measured(axes[name], letter, positions)
+            curves[name] = measured(axes[name], letter, positions)
         else:
-            found[name] = predict(volumes[name], axis, positions, point, notes=notes, name=name)
-    weights = reference_weights([each.value for each in found.values()], positions, axis)
+            curves[name] = predict(volumes[name], axis, positions, point, notes=notes, name=name)
+    weights = reference_weights([each.value for each in curves.values()], positions, axis)
     notes.append(
         f"Errors of {axis} from the volume ({', '.join(volumes)}) by the chain {first.attrs['chain']}, at "
         f"{positions.size} positions. Positioning and rotations are relative to the first, straightness to the line "
@@ -89,7 +89,7 @@ def on_axis(
 
     stored = {
         name: Stored(
-            _placed(found[name]),
+            _placed(curves[name]),
             shift,
             finish=relative,
             levers=levers(place, positions, axis) if axis in LINEAR_AXES else {},
@@ -98,7 +98,7 @@ def on_axis(
     }
     placed = {
         name: _dataset(datasets[name], curve.relative(weights), axis, positions, point, first)
-        for name, curve in found.items()
+        for name, curve in curves.items()
     }
     return placed, stored
 
@@ -164,9 +164,9 @@ def _at_instant(
 ) -> xr.Dataset:
     """Return the errors of an axis over time at the time of the volume."""
     if ds["EX"].dims not in (("time", "position"), ("position", "time"), ("position",)):
-        found = ", ".join(map(str, ds["EX"].dims)) or "nothing"
+        dims = ", ".join(map(str, ds["EX"].dims)) or "nothing"
         raise DatasetError(
-            f"'{name}': expected errors over position, optionally also over time; they depend on {found}",
+            f"'{name}': expected errors over position, optionally also over time; they depend on {dims}",
             code="compare.dims.not_positions",
         )
     if "time" not in ds["EX"].dims:
@@ -201,20 +201,20 @@ def _common_positions(axes: Mapping[str, xr.Dataset], volumes: Mapping[str, xr.D
             raise DatasetError(
                 f"'{name}': no coordinate {letter} along the dimension position", code="compare.coordinate.missing"
             )
-    found = np.sort(np.asarray(next(iter(axes.values()))[letter].values, dtype=float))
+    grid = np.sort(np.asarray(next(iter(axes.values()))[letter].values, dtype=float))
     for ds in axes.values():
-        found = np.array([q for q in found if (np.abs(ds[letter].values - q) <= SAME).any()])
+        grid = np.array([q for q in grid if (np.abs(ds[letter].values - q) <= SAME).any()])
     for ds in volumes.values():
         inside = np.asarray(ds[letter].values, dtype=float)[np.isfinite(ds["EX"].values)]
         if inside.size:
-            found = found[(found >= inside.min() - SAME) & (found <= inside.max() + SAME)]
-    if found.size < 2:
+            grid = grid[(grid >= inside.min() - SAME) & (grid <= inside.max() + SAME)]
+    if grid.size < 2:
         raise DatasetError(
-            f"{', '.join(map(repr, axes))}: {found.size} positions of {letter} in common within the volume; expected "
+            f"{', '.join(map(repr, axes))}: {grid.size} positions of {letter} in common within the volume; expected "
             "at least two, since errors are not extrapolated",
             code="compare.positions.few_common",
         )
-    return found
+    return grid
 
 
 def _dataset(ds: xr.Dataset, curve: Curve, axis: str, positions: Array, point: Array, volume: xr.Dataset) -> xr.Dataset:

@@ -41,23 +41,23 @@ def at_reference(
     """
     stated = {name: str(ds.attrs.get(ATTRIBUTE, "")) for name, ds in datasets.items()}
     place = wanted or next(filter(None, stated.values()), "")
-    found, changed = {}, False
+    moved, changed = {}, False
     for name, ds in datasets.items():
-        found[name] = ds
+        moved[name] = ds
         q = _position(ds)
         if q is None or not _straight(ds):
             continue
         if not stated[name]:
             notes.append(_unknown(name, ds, q, place))
         elif stated[name] != place:
-            found[name], changed = _moved(ds, q, stated[name]), True
-            lost = [each for each in _straight(ds) if np.isnan(found[name][each]).sum() > np.isnan(ds[each]).sum()]
+            moved[name], changed = _moved(ds, q, stated[name]), True
+            lost = [each for each in _straight(ds) if np.isnan(moved[name][each]).sum() > np.isnan(ds[each]).sum()]
             unknown = f" Unknown after it, since the rotations are not all known: {', '.join(lost)}." if lost else ""
             notes.append(
                 f"'{name}': straightness read at a point of the {stated[name]}, transformed to a point of the {place}."
                 + unknown
             )
-    return found, place, changed
+    return moved, place, changed
 
 
 def levers(place: str, q: Array, axis: str) -> dict[str, Array]:

@@ -58,31 +58,31 @@ def predict(
         The targets do not determine any error of the axis.
     """
     positions = np.asarray(positions, dtype=float)
-    found = _errors_of_axes(volume, Machine(str(volume.attrs["chain"]), {axis: point}))
+    fit = _errors_of_axes(volume, Machine(str(volume.attrs["chain"]), {axis: point}))
     names = [dof + axis for dof in DOF]
-    seen = np.array([found.distinguished(name) for name in names])
+    seen = np.array([fit.distinguished(name) for name in names])
     if not seen.any():
         raise DatasetError(
             f"'{name}': its targets do not determine the errors of {axis}; measure more targets",
             code="compare.targets.undetermined",
         )
-    S = np.stack([found.design(each, positions) for each in names], axis=1)
+    S = np.stack([fit.design(each, positions) for each in names], axis=1)
     if notes is not None:
         notes.append(
             f"'{name}': error motions as polynomials up to order {ORDERS}, with priors of the coefficients of order n "
-            f"proportional to n^-p, weighted by their evidence; mean p {found.exponent:.2g}."
+            f"proportional to n^-p, weighted by their evidence; mean p {fit.exponent:.2g}."
         )
-        if found.factor > 1:
+        if fit.factor > 1:
             notes.append(
-                f"'{name}': the residuals of the fit are {np.sqrt(found.factor):.2g} times as large as its uncertainty "
+                f"'{name}': the residuals of the fit are {np.sqrt(fit.factor):.2g} times as large as its uncertainty "
                 "allows; the uncertainty of the derived errors is increased by this factor."
             )
-    value = S @ found.coefficient
-    F = np.concatenate([np.moveaxis(S @ found.shared, 2, 0), np.moveaxis(S @ found.root, 2, 0)])
+    value = S @ fit.coefficient
+    F = np.concatenate([np.moveaxis(S @ fit.shared, 2, 0), np.moveaxis(S @ fit.root, 2, 0)])
     own = np.zeros((positions.size, 6, 6))
     for k, each in enumerate(names):
         if seen[k]:
-            own[:, k, k] = found.rest_at(each, positions)
+            own[:, k, k] = fit.rest_at(each, positions)
     value[:, ~seen], F[:, :, ~seen], own[:, ~seen], own[:, :, ~seen] = np.nan, np.nan, np.nan, np.nan
     number = volume.sizes.get("source", 0)
     source, group, identity = sources_of(volume)

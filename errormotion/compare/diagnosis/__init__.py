@@ -321,9 +321,9 @@ def _improved(
     for shorter in (1.0, 0.5, 0.25, 0.1):
         beta = state.beta.copy()
         beta[list(used)] += shorter * move
-        found = _corrected(candidate, given, beta)
-        if found is not None and found.gain > state.gain:
-            return found
+        corrected = _corrected(candidate, given, beta)
+        if corrected is not None and corrected.gain > state.gain:
+            return corrected
     return None
 
 
@@ -348,7 +348,7 @@ def _best(
     normal: Array, gradient: Array, choices: Sequence[tuple[int, ...]], count: int
 ) -> tuple[list[int], Array, Array, float] | None:
     """Return the choice of sizes with the largest gain minus penalty, with sizes, covariance and gain."""
-    found: tuple[list[int], Array, Array, float] | None = None
+    best: tuple[list[int], Array, Array, float] | None = None
     most = -np.inf
     for choice in choices:
         used = list(choice)
@@ -356,8 +356,8 @@ def _best(
             continue
         beta, C, gain = solved
         if (score := gain - _penalty(len(used), 1, count)) > most:
-            most, found = score, (used, beta, C, gain)
-    return found
+            most, best = score, (used, beta, C, gain)
+    return best
 
 
 def _sizes(normal: Array, gradient: Array) -> tuple[Array, Array, float] | None:

@@ -63,8 +63,8 @@ class SmoothCurves:
 
     def effect(self, time: Array, shift: float, sign: float) -> Array:
         """Return the difference of the changes for a shift of the second dataset; sign -1: the curves are its own."""
-        found = sign * (self(time) - self(time - sign * shift))
-        changed: Array = found - found[0]
+        effect = sign * (self(time) - self(time - sign * shift))
+        changed: Array = effect - effect[0]
         return changed
 
 

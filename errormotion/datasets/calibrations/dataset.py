@@ -44,9 +44,9 @@ class Calibration:
     """Whether the dataset gets the name of its file as the attribute ``name``."""
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        found = self.violations(dataset)
-        if found:
-            raise DatasetError(f"The {self.what} breaks its schema ({self.schema}):", found, code="schema.violated")
+        messages = self.violations(dataset)
+        if messages:
+            raise DatasetError(f"The {self.what} breaks its schema ({self.schema}):", messages, code="schema.violated")
         self.dataset = dataset.load()
         self.coefficients = self._values("coefficient")
         self.coefficient_covariance = self._values("coefficient_covariance")
@@ -130,20 +130,20 @@ def table_violations(
     may_be_unknown : sequence of str
         Variables that may contain NaN.
     """
-    found = storable_violations(ds)
+    messages = storable_violations(ds)
     if ds.attrs.get("schema") != schema:
-        found.append(f"attribute 'schema': expected '{schema}'; found {ds.attrs.get('schema')!r}")
-    found += [
+        messages.append(f"attribute 'schema': expected '{schema}'; found {ds.attrs.get('schema')!r}")
+    messages += [
         f"attribute '{name}': missing; expected {what}" for name, what in attributes.items() if name not in ds.attrs
     ]
-    found += [
+    messages += [
         f"dimension {dim}: expected {size}; found {ds.sizes[dim]}"
         for dim, size in (sizes or {}).items()
         if ds.sizes.get(dim, size) != size
     ]
     for row in rows:
-        found += _row_violations(ds, row, row.name in may_be_unknown)
-    return found
+        messages += _row_violations(ds, row, row.name in may_be_unknown)
+    return messages
 
 
 def _row_violations(ds: xr.Dataset, row: Row, may_be_unknown: bool) -> list[str]:
@@ -154,7 +154,7 @@ def _row_violations(ds: xr.Dataset, row: Row, may_be_unknown: bool) -> list[str]
         return [f"{row.name}: expected dims ({', '.join(row.dims)}); found {dims(variable)}"]
     if variable.size == 0:
         return [f"{row.name}: expected values; found none (a dimension has length 0)"]
-    found = magnitude_violations(row.name, variable, row)
-    if not found and not may_be_unknown and np.isnan(variable.values.astype(float)).any():
-        found = [f"{row.name}: expected numbers; found NaN"]
-    return found
+    messages = magnitude_violations(row.name, variable, row)
+    if not messages and not may_be_unknown and np.isnan(variable.values.astype(float)).any():
+        messages = [f"{row.name}: expected numbers; found NaN"]
+    return messages

@@ -376,10 +376,10 @@ def hole_texts(holes: Sequence[Hole]) -> list[str]:
 
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema of a calibration, one sentence each."""
-    found = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES, _SIZES, _MAY_BE_UNKNOWN)
-    if not found and ds.attrs[ROTATION_ZERO] != AWAY:
-        found = [f"attribute '{ROTATION_ZERO}': expected '{AWAY}'; found {ds.attrs[ROTATION_ZERO]!r}"]
-    return found or _covariance_violations(ds["coefficient_covariance"].transpose("term", "term_").values)
+    messages = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES, _SIZES, _MAY_BE_UNKNOWN)
+    if not messages and ds.attrs[ROTATION_ZERO] != AWAY:
+        messages = [f"attribute '{ROTATION_ZERO}': expected '{AWAY}'; found {ds.attrs[ROTATION_ZERO]!r}"]
+    return messages or _covariance_violations(ds["coefficient_covariance"].transpose("term", "term_").values)
 
 
 def _covariance_violations(C: Array) -> list[str]:

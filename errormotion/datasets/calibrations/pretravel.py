@@ -133,22 +133,22 @@ def assemble(variables: Mapping[str, ArrayLike], attrs: Mapping[str, Any]) -> xr
 
 def violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the schema of a map, one sentence each."""
-    found = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES)
-    if not found and ds.sizes["direction"] != 3:
-        found.append(f"dimension direction: expected 3; found {ds.sizes['direction']}")
-    return found or _value_violations(ds)
+    messages = table_violations(ds, SCHEMA, ROWS, ATTRIBUTES)
+    if not messages and ds.sizes["direction"] != 3:
+        messages.append(f"dimension direction: expected 3; found {ds.sizes['direction']}")
+    return messages or _value_violations(ds)
 
 
 def _value_violations(ds: xr.Dataset) -> list[str]:
     degrees, orders = ds["degree"].values, ds["order"].values
-    found = []
+    messages = []
     if (np.abs(orders) > degrees).any():
-        found.append("order: expected -degree to degree; found another one")
+        messages.append("order: expected -degree to degree; found another one")
     if (degrees == 1).any():
-        found.append("degree: expected no term of degree 1 (not separable from the position of the ball); found one")
+        messages.append("degree: expected no term of degree 1 (not separable from the position of the ball); found one")
     C = ds["coefficient_covariance"].transpose("term", "term_").values
     if C.shape[0] != C.shape[1] or not np.allclose(C, C.T, rtol=1e-8, atol=0.0):
-        found.append("coefficient_covariance: expected a symmetric matrix; found another")
+        messages.append("coefficient_covariance: expected a symmetric matrix; found another")
     elif np.linalg.eigvalsh(C).min() < -1e-9 * max(float(np.abs(C).max()), 1e-30):
-        found.append("coefficient_covariance: expected no negative variance; found one")
-    return found
+        messages.append("coefficient_covariance: expected no negative variance; found one")
+    return messages

@@ -114,8 +114,8 @@ def _circles(corners: Array) -> tuple[Array, Array]:
 
 def _cosines(corners: Array) -> Array:
     """Return the cosines (m, 3) of the angles at the corners (m, 3, 2)."""
-    found = np.empty(corners.shape[:2])
+    cosines = np.empty(corners.shape[:2])
     for k in range(3):
         one, other = (corners[:, (k + step) % 3] - corners[:, k] for step in (1, 2))
-        found[:, k] = (one * other).sum(axis=1) / np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
-    return found
+        cosines[:, k] = (one * other).sum(axis=1) / np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
+    return cosines

@@ -99,8 +99,8 @@ class TiltSupport:
         bare = ~self._counts
         bare[bare] = ~self.holds(self._mesh.corners[bare].mean(axis=1))
         # A row of settings that is supported by itself separates two holes.
-        found = [self._hole(part) for part in self._mesh.parts(bare, self._sides_count)]
-        return sorted(found, key=lambda hole: (np.round(hole.inclination, 3).tolist(), hole.rotation))
+        holes = [self._hole(part) for part in self._mesh.parts(bare, self._sides_count)]
+        return sorted(holes, key=lambda hole: (np.round(hole.inclination, 3).tolist(), hole.rotation))
 
     def nearest(self, q: Array, count: int = 3) -> Array:
         """Return the calibrated tilts (count, 2) nearest to one tilt (2,)."""
@@ -145,16 +145,16 @@ class TiltSupport:
         def near(some: NDArray[np.int64], settings: Array) -> NDArray[np.bool_]:
             at = points[some, None]
             apart = np.abs(np.arctan(_size(at)) - np.arctan(_size(settings)))
-            found: NDArray[np.bool_] = ((apart <= self._reach) & (_way(at, settings) <= wide[some, None])).any(axis=1)
-            return found
+            met: NDArray[np.bool_] = ((apart <= self._reach) & (_way(at, settings) <= wide[some, None])).any(axis=1)
+            return met
 
-        found = near(np.arange(len(points)), corners)
-        rest = np.flatnonzero(~found)
+        met = near(np.arange(len(points)), corners)
+        rest = np.flatnonzero(~met)
         step = max(1, _BLOCK // len(self.tilts))
         for start in range(0, len(rest), step):
             some = rest[start : start + step]
-            found[some] = near(some, self.tilts[None])
-        return found
+            met[some] = near(some, self.tilts[None])
+        return met
 
     @cached_property
     def _sides_count(self) -> NDArray[np.bool_]:

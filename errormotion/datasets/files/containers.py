@@ -72,30 +72,30 @@ def check_netcdf(path: Path) -> None:
             raise DatasetError(
                 f"{path}: expected at most {MAX_VARIABLES} variables; found {len(file)}", code="file.variables.too_many"
             )
-        found, total, variables = [], 0, {}
+        messages, total, variables = [], 0, {}
         for name in file:
             link = file.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
-                found.append(f"{name!r:.100}: expected values in this file; found a link")
+                messages.append(f"{name!r:.100}: expected values in this file; found a link")
                 continue
             variable = file[name]
             if not isinstance(variable, h5py.Dataset):
                 continue  # groups are not read
             if variable.external or variable.is_virtual:
-                found.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
-            found += [f"{name!r:.100}: {text}" for text in wrong_types(variable)]
+                messages.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
+            messages += [f"{name!r:.100}: {text}" for text in wrong_types(variable)]
             pieces, decoded = variable.chunks or (), any(each in variable.attrs for each in _DECODED)
             item = max(DECODED if decoded else 1, variable.id.get_type().get_size())
             chunks = math.prod(_counts(variable.shape, pieces)) if pieces else 0
             values = max(_number(variable.shape or ()), math.prod(pieces)) * item
             total += max(values, chunks * PER_CHUNK_OF_HDF5)
             variables[name] = variable
-        found += [f"/: {text}" for text in wrong_types(file)]
-        if not found and total <= _most(size):  # what follows reads as much as the file states
+        messages += [f"/: {text}" for text in wrong_types(file)]
+        if not messages and total <= _most(size):  # what follows reads as much as the file states
             stored = Stored(path, size, file)
-            found += [f"{name!r:.100}: {text}" for name, each in variables.items() for text in violations(each)]
+            messages += [f"{name!r:.100}: {text}" for name, each in variables.items() for text in violations(each)]
             total += stored.texts(variables.values(), _most(size) - total)
-    _raise(path, found, total, size)
+    _raise(path, messages, total, size)
 
 
 def check_classic(path: Path) -> None:
@@ -183,18 +183,18 @@ def check_zarr(path: Path) -> None:
         raise DatasetError(
             f"{path}: expected at most {MAX_VARIABLES} arrays; found {len(arrays)}", code="file.variables.too_many"
         )
-    found, total = [], 0
+    messages, total = [], 0
     for name, metadata in arrays.items():
         if isinstance(metadata, dict) and metadata.get("node_type") == "group":
             continue  # groups are not read
         wrong = _wrong(metadata)
         if wrong:
-            found.append(f"{name!r:.100}: {wrong}")
+            messages.append(f"{name!r:.100}: {wrong}")
             continue
         chunks = math.prod(_counts(metadata["shape"], _chunk_shape(metadata)))
         total += max(_stated(metadata), chunks * PER_CHUNK_OF_ZARR)
-        found += [f"{name!r:.100}: {text}" for text in _wrong_chunks(path / name, metadata, size)]
-    _raise(path, found, total, size)
+        messages += [f"{name!r:.100}: {text}" for text in _wrong_chunks(path / name, metadata, size)]
+    _raise(path, messages, total, size)
 
 
 def _most(size: int) -> int:
@@ -212,13 +212,13 @@ def _counts(shape: Sequence[int], chunk: Sequence[int]) -> list[int]:
     return [-(-size // each) for size, each in zip(shape, chunk, strict=True)]
 
 
-def _raise(path: Path, found: list[str], total: int, size: int) -> None:
+def _raise(path: Path, messages: list[str], total: int, size: int) -> None:
     if total > _most(size):
-        found.append(
+        messages.append(
             f"expected at most {_most(size)} bytes of values in a file or folder of {size} bytes; it states {total}"
         )
-    if found:
-        raise DatasetError(f"{path}: is damaged, or malicious:", found, code="file.malicious")
+    if messages:
+        raise DatasetError(f"{path}: is damaged, or malicious:", messages, code="file.malicious")
 
 
 def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
@@ -242,10 +242,10 @@ def _files(folder: Path, store: Path, depth: int) -> Iterator[int]:
 
 
 def _metadata(file: Path) -> dict[str, Any]:
-    found = parse_json(read_bytes(file, MAX_METADATA))
-    if not isinstance(found, dict):
-        raise DatasetError(f"{file}: expected an object; found {type(found).__name__}", code="zarr.metadata.form")
-    return found
+    metadata = parse_json(read_bytes(file, MAX_METADATA))
+    if not isinstance(metadata, dict):
+        raise DatasetError(f"{file}: expected an object; found {type(metadata).__name__}", code="zarr.metadata.form")
+    return metadata
 
 
 def _wrong(metadata: Any) -> str:
@@ -265,13 +265,13 @@ def _wrong(metadata: Any) -> str:
     if metadata.get("storage_transformers"):
         return "expected no storage_transformers"
     codecs = metadata.get("codecs")
-    found = (
+    messages = (
         [each.get("name") if isinstance(each, dict) else each for each in codecs] if isinstance(codecs, list) else []
     )
-    if not found or not all(each in CODECS for each in found):
-        return f"expected codecs of {', '.join(CODECS)}; found {found!r:.100}"
-    if len({*found}) < len(found) or {*_COMPRESSORS} <= {*found}:
-        return f"expected each codec once, and one of {' and '.join(_COMPRESSORS)} at most; found {found!r:.100}"
+    if not messages or not all(each in CODECS for each in messages):
+        return f"expected codecs of {', '.join(CODECS)}; found {messages!r:.100}"
+    if len({*messages}) < len(messages) or {*_COMPRESSORS} <= {*messages}:
+        return f"expected each codec once, and one of {' and '.join(_COMPRESSORS)} at most; found {messages!r:.100}"
     return ""
 
 
@@ -342,13 +342,13 @@ def _chunks(path: str, counts: Sequence[int]) -> Iterator[str]:
         return
     try:
         with os.scandir(path) as inside:
-            found = [each.path for each in inside if _is_below(each.name, counts[0])]
+            chunks = [each.path for each in inside if _is_below(each.name, counts[0])]
     except NotADirectoryError:
         return
     if len(counts) == 1:
-        yield from found
+        yield from chunks
     else:
-        for each in found:
+        for each in chunks:
             yield from _chunks(each, counts[1:])
 
 

@@ -127,16 +127,16 @@ def read(folder: Path) -> tuple[tuple[Event, ...], tuple[str, ...]]:
         return (), (f"{file}: cannot be read: {error.strerror}",)
     if len(data) > MAX_FILE:
         return (), (f"{file}: expected at most {MAX_FILE} bytes; it is larger",)
-    found, wrong = list[Event](), list[str]()
+    events, wrong = list[Event](), list[str]()
     for number, line in enumerate(data.decode(errors="replace").split("\n"), 1):
         if not line.strip():
             continue
         made = from_plain(line)
         if isinstance(made, Event):
-            found.append(made)
+            events.append(made)
         else:
             wrong.append(f"{file}, line {number}: {made}")
-    return tuple(found), tuple(wrong)
+    return tuple(events), tuple(wrong)
 
 
 def from_plain(line: Any) -> Event | str:

@@ -123,9 +123,9 @@ class Stored:
         for variable in variables:
             references += _in_attributes(variable)
             if is_text(variable):
-                found = self._lengths(variable)
-                exact += found or 0
-                references += math.prod(variable.shape or ()) if found is None else 0
+                lengths = self._lengths(variable)
+                exact += lengths or 0
+                references += math.prod(variable.shape or ()) if lengths is None else 0
         if exact + WIDTH * references * self.size <= most:
             return exact + WIDTH * references * self.size
         return exact + WIDTH * references * self._largest()

@@ -74,14 +74,14 @@ def parse_json(text: str | bytes) -> Any:
         It is not JSON in UTF-8, or has more than DEEPEST levels.
     """
     try:
-        found = json.loads(text)
+        value = json.loads(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    level = [found]
+    level = [value]
     for _ in range(DEEPEST):
         level = [each for outer in level for each in _inside(outer) if isinstance(each, dict | list)]
         if not level:
-            return found
+            return value
     raise ValueError(f"nested too deeply; expected at most {DEEPEST} levels")
 
 

@@ -122,7 +122,7 @@ def read_run(folder: Path) -> State:
     """
     file = folder / FILE
     try:
-        found = parse_json(read_bytes(file, MAX_FILE))
+        content = parse_json(read_bytes(file, MAX_FILE))
     except OSError as error:
         raise RunError(
             f"{folder}: expected a run folder with a {FILE}; {error.strerror}", code="run.folder.not_found"
@@ -133,16 +133,16 @@ def read_run(folder: Path) -> State:
             "or identify raw.zarr with 'errormotion identify'",
             code="run.file.no_json",
         ) from error
-    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
-        what = found.get("schema") if isinstance(found, dict) else type(found).__name__
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        what = content.get("schema") if isinstance(content, dict) else type(content).__name__
         raise RunError(f"{file}: expected schema '{SCHEMA}'; found {what!r:.100}", code="run.file.schema")
-    mistakes = tomlfile.check(found, _Run, edge=False)[1]
+    mistakes = tomlfile.check(content, _Run, edge=False)[1]
     if mistakes:
         raise RunError(tomlfile.report(file, mistakes), code="run.file.mistakes")
-    return _stated(found, file)
+    return _stated(content, file)
 
 
-def _stated(found: dict[str, Any], file: Path) -> State:
-    state = State({key: _stated(each, file) if isinstance(each, dict) else each for key, each in found.items()})
+def _stated(table: dict[str, Any], file: Path) -> State:
+    state = State({key: _stated(each, file) if isinstance(each, dict) else each for key, each in table.items()})
     state.file = file
     return state

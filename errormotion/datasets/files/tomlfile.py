@@ -72,10 +72,10 @@ def load_model(path: str | Path, model: type[Model], *, error: type[ErrormotionE
         Of the type ``error``: the file cannot be read, is not TOML (with line and column), or contains mistakes (all
         of them in one message).
     """
-    found, mistakes = check(read_toml(path, error=error), model)
-    if found is None:
+    loaded, mistakes = check(read_toml(path, error=error), model)
+    if loaded is None:
         raise error(report(path, mistakes), code="toml.mistakes")
-    return found
+    return loaded
 
 
 def read_toml(path: str | Path, *, error: type[ErrormotionError] = DatasetError) -> dict[str, Any]:
@@ -188,8 +188,8 @@ def grouped(mistakes: Sequence[str]) -> list[str]:
 def single(line: str) -> list[str]:
     """Return the single mistakes of a line of `grouped`."""
     keys, sign, text = line.partition(": ")
-    found = keys.split(", ")
-    return [f"{key}: {text}" for key in found] if sign and all(map(_KEY.fullmatch, found)) else [line]
+    names = keys.split(", ")
+    return [f"{key}: {text}" for key in names] if sign and all(map(_KEY.fullmatch, names)) else [line]
 
 
 def dotted(keys: Iterable[Key]) -> str:

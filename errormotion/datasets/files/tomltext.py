@@ -142,8 +142,8 @@ class _Statement:
 
 
 def _changed(text: str, place: tuple[Key, ...], content: Any, expected: Any) -> str:
-    found = list(_statements(text))
-    for each in found:
+    statements = list(_statements(text))
+    for each in statements:
         if each.value is None or each.place != place[: len(each.place)]:
             continue
         if content is None and each.place == place:
@@ -151,13 +151,13 @@ def _changed(text: str, place: tuple[Key, ...], content: Any, expected: Any) -> 
         return text[: each.value[0]] + value(_at(expected, each.place)) + text[each.value[1] :]
     if content is None:
         return text
-    beside = [each for each in found if each.value is not None and each.place[:-1] == place[:-1]]
+    beside = [each for each in statements if each.value is not None and each.place[:-1] == place[:-1]]
     table = beside[-1].table if beside else place[:-1]  # another one if the keys beside it are dotted
     line = f"{'.'.join(key(str(name)) for name in place[len(table) :])} = {value(content)}\n"
-    own = beside or [each for each in found if each.table == table]
+    own = beside or [each for each in statements if each.table == table]
     first = 0
     if not own and table:
-        own = [each for each in found if each.table[: len(table) - 1] == table[:-1]]
+        own = [each for each in statements if each.table[: len(table) - 1] == table[:-1]]
         line = f"[{'.'.join(key(name) for name in table if isinstance(name, str))}]\n{line}"
         first = len(text)  # keys above would belong to the table
     at = own[-1].end if own else first
@@ -196,15 +196,15 @@ def _statements(text: str) -> Iterator[_Statement]:
 
 
 def _line_end(text: str, at: int) -> int:
-    found = text.find("\n", at)
-    return len(text) if found < 0 else found + 1
+    end = text.find("\n", at)
+    return len(text) if end < 0 else end + 1
 
 
 def _names(keys: str) -> list[str]:
     """Return the parts of a dotted key."""
-    found, names = tomllib.loads(f"{keys} = 0"), []
-    while isinstance(found, dict):
-        name, found = next(iter(found.items()))
+    table, names = tomllib.loads(f"{keys} = 0"), []
+    while isinstance(table, dict):
+        name, table = next(iter(table.items()))
         names.append(name)
     return names
 

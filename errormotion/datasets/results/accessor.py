@@ -311,8 +311,8 @@ class ErrorMotion:
         places, e, C, F = self._known(names, among)
         if not places.size:
             return None
-        found = largest(e, C, F)
-        return replace(found, place=int(places[found.place]))
+        result = largest(e, C, F)
+        return replace(result, place=int(places[result.place]))
 
     def root_mean_square(self, *names: str) -> Extremes | None:
         """Return the root mean square of one freedom, or of the length of several, over all places where it is known.

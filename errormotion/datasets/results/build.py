@@ -169,10 +169,10 @@ def build_errors(
         raise DatasetError(
             f"Values, coordinates and extra results do not fit together: {error}", code="errors.arrays.shape"
         ) from error
-    found = error_violations(ds)
-    if found:
+    messages = error_violations(ds)
+    if messages:
         raise DatasetError(
-            f"The result of method '{method}' breaks the schema {SCHEMA}:", found, code="schema.violated"
+            f"The result of method '{method}' breaks the schema {SCHEMA}:", messages, code="schema.violated"
         )
     return ds if measured is None else with_doubts(ds, of_result(ds))
 
@@ -220,7 +220,7 @@ def build_deviations(
     """
     dims, value = tuple(dims), np.asarray(deviation, dtype=float)
     h = np.asarray(sensitivity, dtype=float)
-    found: dict[str, Any] = {
+    variables: dict[str, Any] = {
         "deviation": (dims, value, {"units": "m"}),
         "deviation_variance": (dims, np.where(np.isnan(value), np.nan, variance), {"units": "m^2"}),
         "sensitivity": ((*(dims if h.ndim > 1 else ()), "dof"), h, {"long_name": "of the deviation to each freedom"}),
@@ -231,9 +231,11 @@ def build_deviations(
         coords |= {"source": names, "source_group": ("source", list(source_groups or ()))}
         coords |= _identities(names, attributes.pop("source_ids", {}), attributes.pop("reference_sources", ()))
         unknown = np.broadcast_to(np.isnan(value), np.shape(influence))
-        found["deviation_influence"] = (("source", *dims), np.where(unknown, np.nan, influence), {"units": "m"})
+        variables["deviation_influence"] = (("source", *dims), np.where(unknown, np.nan, influence), {"units": "m"})
     try:
-        arrays = {name: xr.DataArray(array, dims=names, attrs=attrs) for name, (names, array, attrs) in found.items()}
+        arrays = {
+            name: xr.DataArray(array, dims=names, attrs=attrs) for name, (names, array, attrs) in variables.items()
+        }
     except ValueError as error:
         raise DatasetError(
             f"Deviation, variance, sensitivity and influence do not fit together: {error}", code="errors.arrays.shape"
@@ -250,13 +252,13 @@ def build_deviations(
 
 
 def _check_shapes(E: Array, C: Array, dims: tuple[str, ...]) -> None:
-    found = []
+    messages = []
     if E.ndim != len(dims) + 1 or E.shape[-1] != 6:
-        found.append(f"values: expected shape ({', '.join([*dims, '6'])}); found {E.shape}")
+        messages.append(f"values: expected shape ({', '.join([*dims, '6'])}); found {E.shape}")
     elif (*E.shape, 6) != C.shape:
-        found.append(f"covariance: expected shape {(*E.shape, 6)}; found {C.shape}")
-    if found:
-        raise DatasetError("Arrays do not fit together:", found, code="errors.arrays.shape")
+        messages.append(f"covariance: expected shape {(*E.shape, 6)}; found {C.shape}")
+    if messages:
+        raise DatasetError("Arrays do not fit together:", messages, code="errors.arrays.shape")
 
 
 def _influence(

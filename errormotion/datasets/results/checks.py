@@ -60,12 +60,12 @@ _ROWS = {row.name: row for row in ERROR_ROWS}
 
 def error_violations(ds: xr.Dataset) -> list[str]:
     """Return every violation of the error schema, one sentence each."""
-    found = [*_attribute_violations(ds), *storable_violations(ds)]
+    messages = [*_attribute_violations(ds), *storable_violations(ds)]
     missing = [name for name in DOF if name not in ds.data_vars]
     if missing:
-        return [*found, f"{' '.join(missing)}: missing; expected all of {' '.join(DOF)}, NaN if unknown"]
+        return [*messages, f"{' '.join(missing)}: missing; expected all of {' '.join(DOF)}, NaN if unknown"]
     dims = ds["EX"].dims
-    found += _dim_violations(ds, dims)
+    messages += _dim_violations(ds, dims)
     complaints = []
     for name, unit in zip(DOF, ERROR_UNITS, strict=True):
         variable = ds.variables[name]
@@ -74,37 +74,37 @@ def error_violations(ds: xr.Dataset) -> list[str]:
         if variable.attrs.get("units") is None:
             complaints.append(f"{name}: expected the attribute units = '{unit}'; found none")
         complaints += magnitude_violations(name, variable, _ROWS[name])
-    found += complaints + _coordinate_violations(ds) + _comparison_violations(ds, dims)
+    messages += complaints + _coordinate_violations(ds) + _comparison_violations(ds, dims)
     shape_complaints = _shape_violations(ds, dims)
-    found += shape_complaints
+    messages += shape_complaints
     if not complaints and not shape_complaints:
-        found += _covariance_violations(ds)
-        found += _deviation_violations(ds, dims)
-    return found
+        messages += _covariance_violations(ds)
+        messages += _deviation_violations(ds, dims)
+    return messages
 
 
 def _attribute_violations(ds: xr.Dataset) -> list[str]:
-    found = []
+    messages = []
     for name, meaning in ERROR_ATTRIBUTES.items():
         value = ds.attrs.get(name)
         if value is None:
-            found.append(f"attribute '{name}': missing; expected {meaning}")
+            messages.append(f"attribute '{name}': missing; expected {meaning}")
         elif name == "functional_point":
-            found += _point_violations(value)
+            messages += _point_violations(value)
         elif not isinstance(value, str) or not value.strip():
-            found.append(f"attribute '{name}': expected {meaning}; found {value!r}")
+            messages.append(f"attribute '{name}': expected {meaning}; found {value!r}")
         elif name == "sign" and value != SIGN:
-            found.append(f"attribute 'sign': expected '{SIGN}'; found '{value}'. Reverse the values and set it")
+            messages.append(f"attribute 'sign': expected '{SIGN}'; found '{value}'. Reverse the values and set it")
         elif name == "schema" and value != SCHEMA:
-            found.append(f"attribute 'schema': expected '{SCHEMA}'; found '{value}'")
+            messages.append(f"attribute 'schema': expected '{SCHEMA}'; found '{value}'")
         elif name == "component" and value not in COMPONENTS and not str(ds.attrs.get("component_description", "")):
-            found.append(
+            messages.append(
                 f"attribute 'component': expected one of {', '.join(COMPONENTS)}; found '{value}'. Describe another "
                 "one in the attribute 'component_description'"
             )
         elif name == "provenance" and not _is_json_object(value):
-            found.append("attribute 'provenance': expected a JSON object; found other text")
-    return found
+            messages.append("attribute 'provenance': expected a JSON object; found other text")
+    return messages
 
 
 def _point_violations(value: Any, name: str = "functional_point") -> list[str]:
@@ -128,68 +128,68 @@ def _is_json_object(text: str) -> bool:
 
 
 def _coordinate_violations(ds: xr.Dataset) -> list[str]:
-    found = []
+    messages = []
     if "time" in ds.sizes:
         if "time" not in ds.variables:
-            found.append("time: missing; expected seconds since the reference state")
+            messages.append("time: missing; expected seconds since the reference state")
         else:
-            found += unit_violations("time", ds.variables["time"].attrs, "s")
-            found += time_violations("time", ds.variables["time"])
+            messages += unit_violations("time", ds.variables["time"].attrs, "s")
+            messages += time_violations("time", ds.variables["time"])
     for name in ("x", "y", "z"):
         if name in ds.variables:
             if not set(ds.variables[name].dims) <= {"position", "target"}:
-                found.append(f"{name}: expected dims position or target; found {dims_text(ds.variables[name])}")
-            found += magnitude_violations(name, ds.variables[name], _ROWS[name])
+                messages.append(f"{name}: expected dims position or target; found {dims_text(ds.variables[name])}")
+            messages += magnitude_violations(name, ds.variables[name], _ROWS[name])
     if "temperature" in ds.coords and "sensor" in ds["temperature"].dims:
         row = Row("temperature", ("...", "sensor"), "degC", -60.0, 200.0, "")
-        found += magnitude_violations("temperature", ds.variables["temperature"], row)
-    return found
+        messages += magnitude_violations("temperature", ds.variables["temperature"], row)
+    return messages
 
 
 def _comparison_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
     """Return violations in the requirements of a comparison: start, reference, identities, unchanged values."""
-    found = []
+    messages = []
     start = ds.attrs.get("start")
     if start is not None and not _is_instant(start):
-        found.append(f"attribute 'start': expected {OPTIONAL_ATTRIBUTES['start']}; found {start!r}")
+        messages.append(f"attribute 'start': expected {OPTIONAL_ATTRIBUTES['start']}; found {start!r}")
     for name, size in (("reference_interval", 2), ("reference_position", 1)):
         if name in ds.attrs and not _is_rising(ds.attrs[name], size):
-            found.append(f"attribute '{name}': expected {OPTIONAL_ATTRIBUTES[name]}; found {ds.attrs[name]!r}")
-    found += _machine_violations(ds)
+            messages.append(f"attribute '{name}': expected {OPTIONAL_ATTRIBUTES[name]}; found {ds.attrs[name]!r}")
+    messages += _machine_violations(ds)
     for name in ("source_id", "source_reference"):
         if name in ds.variables and ds.variables[name].dims != ("source",):
-            found.append(f"{name}: expected dims (source); found {dims_text(ds.variables[name])}")
+            messages.append(f"{name}: expected dims (source); found {dims_text(ds.variables[name])}")
     if "source_id" in ds.coords and ds.variables["source_id"].dims == ("source",):
         ids = [each for each in ds["source_id"].values.tolist() if each]
         if len(set(ids)) < len(ids):
-            found.append("source_id: expected texts that differ, or empty ones; found one repeated")
+            messages.append("source_id: expected texts that differ, or empty ones; found one repeated")
     for name in (f"{dim}{INDEX}" for dim in dims):
         if name not in ds.variables:
             continue
         variable = ds.variables[name]
         numbers = np.asarray(variable.values, dtype=float) if variable.dtype.kind in "iuf" else np.empty(0)
         if variable.dims != (name.removesuffix(INDEX),) or not (numbers % 1 == 0).all():
-            found.append(_TOUCHED.format(name))
+            messages.append(_TOUCHED.format(name))
     lost = [name for name in ds.variables if str(name).endswith(INDEX) and str(name).removesuffix(INDEX) not in dims]
     # A selected value, as by isel(position=3), keeps its number; a mean converts it to a float.
-    found += [_TOUCHED.format(name) for name in lost if ds[name].ndim or ds[name].dtype.kind not in "iu"]
-    return found
+    messages += [_TOUCHED.format(name) for name in lost if ds[name].ndim or ds[name].dtype.kind not in "iu"]
+    return messages
 
 
 def _machine_violations(ds: xr.Dataset) -> list[str]:
     """Return violations in the attributes of the machine and its frame."""
-    found = []
+    messages = []
     if "chain" in ds.attrs:
         try:
             parse_chain(ds.attrs["chain"])
         except (ValueError, AttributeError, TypeError) as error:
-            found.append(f"attribute 'chain': {error}")
+            messages.append(f"attribute 'chain': {error}")
     if "frame_origin" in ds.attrs:
-        found += _point_violations(ds.attrs["frame_origin"], "frame_origin")
+        messages += _point_violations(ds.attrs["frame_origin"], "frame_origin")
     axes = ds.attrs.get("lever_axes", "Z")
     if axes not in _LEVERS:
-        found.append(f"attribute 'lever_axes': expected one of {', '.join(_LEVERS)}; found {axes!r}")
-    return found + straightness_reference_violations(ds)
+        messages.append(f"attribute 'lever_axes': expected one of {', '.join(_LEVERS)}; found {axes!r}")
+    return messages + straightness_reference_violations(ds)
 
 
 _LEVERS = ("X", "Y", "Z", "XY", "XZ", "YZ", "XYZ")
@@ -216,26 +216,26 @@ def _is_rising(value: Any, size: int) -> bool:
 
 
 def _shape_violations(ds: xr.Dataset, dims: tuple[Any, ...]) -> list[str]:
-    found = []
+    messages = []
     for dim in ("dof", "dof_"):
         if dim in ds.sizes:
-            found += label_violations(ds, dim, DOF)
+            messages += label_violations(ds, dim, DOF)
     expected = {"covariance": (*dims, "dof", "dof_"), "influence": ("source", *dims, "dof")}
     for name, names in expected.items():
         if name not in ds.variables:
             if name == "covariance":
-                found.append(f"covariance({', '.join(names)}): missing; expected the total covariance")
+                messages.append(f"covariance({', '.join(names)}): missing; expected the total covariance")
             continue
         variable = ds.variables[name]
         if variable.dims != names:
-            found.append(f"{name}: expected dims ({', '.join(names)}); found {dims_text(variable)}")
+            messages.append(f"{name}: expected dims ({', '.join(names)}); found {dims_text(variable)}")
         elif variable.dtype.kind != "f":
-            found.append(f"{name}: expected float64; found {variable.dtype}")
+            messages.append(f"{name}: expected float64; found {variable.dtype}")
     if {"influence", "deviation_influence"} & set(ds.variables):
         for name in ("source", "source_group"):
             if name not in ds.variables or ds.variables[name].dims != ("source",):
-                found.append(f"{name}(source): missing; expected a text for each source")
-    return found
+                messages.append(f"{name}(source): missing; expected a text for each source")
+    return messages
 
 
 def _covariance_violations(ds: xr.Dataset) -> list[str]:
@@ -243,13 +243,13 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
     unseen = np.stack([np.isnan(ds.variables[name].values) for name in DOF], axis=-1).reshape(-1, 6)
     C = np.asarray(ds.variables["covariance"].values, dtype=float).reshape(-1, 6, 6)
     unknown = unseen[:, :, None] | unseen[:, None, :]
-    found = []
+    messages = []
     if not np.array_equal(np.isnan(C), unknown):
-        found.append(_pattern("covariance", np.isnan(C) != unknown))
+        messages.append(_pattern("covariance", np.isnan(C) != unknown))
     if np.isinf(C).any():
-        found.append("covariance: expected finite numbers; found an infinite one")
-    if found:
-        return found
+        messages.append("covariance: expected finite numbers; found an infinite one")
+    if messages:
+        return messages
     C = np.where(unknown, 0.0, C)
     variance = np.diagonal(C, axis1=1, axis2=2)
     if (variance < 0).any():
@@ -263,8 +263,8 @@ def _covariance_violations(ds: xr.Dataset) -> list[str]:
     if not _is_positive(correlation):
         return ["covariance: expected no negative variance in any direction (positive semidefinite); found one"]
     if "influence" in ds.variables:
-        found += _influence_violations(ds, unseen, correlation, scale)
-    return found
+        messages += _influence_violations(ds, unseen, correlation, scale)
+    return messages
 
 
 def _influence_violations(ds: xr.Dataset, unseen: NDArray[np.bool_], correlation: Array, scale: Array) -> list[str]:
@@ -302,10 +302,10 @@ def _is_positive(matrices: Array) -> bool:
 
 def _dim_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
     """Return violations in further dimensions of the errors, each of which needs a coordinate."""
-    found = []
+    messages = []
     for dim in (str(dim) for dim in dims if dim not in ERROR_DIMS):
         if dim not in ds.coords or not str(ds.coords[dim].attrs.get("long_name", "")).strip():
-            found.append(
+            messages.append(
                 f"EX: expected dims from {', '.join(ERROR_DIMS)}, or declared by a coordinate of the same name with "
                 f"the attribute long_name; found {dim}"
             )
@@ -313,12 +313,12 @@ def _dim_violations(ds: xr.Dataset, dims: Sequence[Hashable]) -> list[str]:
         values = ds.coords[dim].values
         if values.dtype.kind in "iuf":
             if not ds.coords[dim].attrs.get("units"):
-                found.append(f"{dim}: expected the attribute units; found none")
+                messages.append(f"{dim}: expected the attribute units; found none")
             if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
-                found.append(f"{dim}: expected finite values that increase")
+                messages.append(f"{dim}: expected finite values that increase")
         elif len(set(values.tolist())) < values.size:
-            found.append(f"{dim}: expected labels that differ; found one repeated")
-    return found
+            messages.append(f"{dim}: expected labels that differ; found one repeated")
+    return messages
 
 
 def _deviation_violations(ds: xr.Dataset, dims: tuple[Hashable, ...]) -> list[str]:
@@ -335,38 +335,38 @@ def _deviation_violations(ds: xr.Dataset, dims: tuple[Hashable, ...]) -> list[st
     missing = [name for name in _DEVIATION[:3] if name not in ds.variables]
     if missing:
         return [f"{' '.join(missing)}: missing; expected with {present[0]}"]
-    found = []
+    messages = []
     for name in present:
         variable = ds.variables[name]
         expected = {"deviation_influence": ("source", *dims)}.get(name, dims)
         if name == "sensitivity":
             if variable.dims[-1:] != ("dof",) or not set(variable.dims[:-1]) <= set(dims):
-                found.append(f"sensitivity: expected dims of deviation, and dof; found {dims_text(variable)}")
+                messages.append(f"sensitivity: expected dims of deviation, and dof; found {dims_text(variable)}")
         elif variable.dims != expected:
-            found.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {dims_text(variable)}")
-        found += magnitude_violations(name, variable, _ROWS[name])
-    return found or _value_violations(ds)
+            messages.append(f"{name}: expected dims ({', '.join(map(str, expected))}); found {dims_text(variable)}")
+        messages += magnitude_violations(name, variable, _ROWS[name])
+    return messages or _value_violations(ds)
 
 
 def _value_violations(ds: xr.Dataset) -> list[str]:
-    found = []
+    messages = []
     unknown = np.isnan(ds.variables["deviation"].values)
     known_freedoms = [name for name in DOF if np.isfinite(ds.variables[name].values).any()]
     if known_freedoms:
-        found.append(f"{' '.join(known_freedoms)}: expected NaN in a dataset with deviation, their combination")
+        messages.append(f"{' '.join(known_freedoms)}: expected NaN in a dataset with deviation, their combination")
     for name in ("deviation_variance", "deviation_influence"):
         if name in ds.variables:
             gaps = np.isnan(ds.variables[name].values)
             if not np.array_equal(gaps, np.broadcast_to(unknown, gaps.shape)):
-                found.append(f"{name}: expected NaN exactly where deviation is NaN")
+                messages.append(f"{name}: expected NaN exactly where deviation is NaN")
     length = np.linalg.norm(ds.variables["sensitivity"].values[..., :3], axis=-1)
     if not (np.abs(length - 1) <= UNIT_LENGTH).all():
         worst = float(length.ravel()[np.argmax(np.abs(length.ravel() - 1))])
-        found.append(f"sensitivity: expected a unit vector for EX EY EZ; found one of length {number(worst)}")
-    if found or "deviation_influence" not in ds.variables:
-        return found
+        messages.append(f"sensitivity: expected a unit vector for EX EY EZ; found one of length {number(worst)}")
+    if messages or "deviation_influence" not in ds.variables:
+        return messages
     shared = (ds.variables["deviation_influence"].values ** 2).sum(axis=0)
     total = ds.variables["deviation_variance"].values
     if (shared > total * (1 + ROUNDING)).any():
-        found.append("deviation_influence: expected squares that sum to no more than deviation_variance")
-    return found
+        messages.append("deviation_influence: expected squares that sum to no more than deviation_variance")
+    return messages

@@ -27,9 +27,9 @@ def effects_of(errors: xr.Dataset, figure: FigureOfMerit) -> Mapping[str, float]
     influence = influence_of(errors)
     if influence not in errors or not 0 < errors.sizes.get("source", 0) <= MAX_SOURCES:
         return None
-    found = {str(name): change_of(errors, row, figure.name) for row, name in enumerate(errors["source"].values)}
-    known = [effect for effect in found.values() if np.isfinite(effect)]
-    return found if known and len(known) == len(found) and any(known) else None
+    effects = {str(name): change_of(errors, row, figure.name) for row, name in enumerate(errors["source"].values)}
+    known = [effect for effect in effects.values() if np.isfinite(effect)]
+    return effects if known and len(known) == len(effects) and any(known) else None
 
 
 def influence_of(errors: xr.Dataset) -> str:

@@ -164,10 +164,10 @@ def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, to
     # The interval from value k to k + 1 has the second differences at k and k + 1.
     none = np.zeros((1, *excess.shape[1:]))
     beside, unit = (np.concatenate([none, each]) + np.concatenate([each, none]) for each in (excess, scale))
-    found: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
+    intensity_at: Array = np.maximum(beside, 0.0) / np.where(unit > 0, unit, np.inf)
     if starting:
-        found[0] = np.where(known[0], _starting(h[0], g[0], values[:3], variance[:3]), found[0])
-    return found
+        intensity_at[0] = np.where(known[0], _starting(h[0], g[0], values[:3], variance[:3]), intensity_at[0])
+    return intensity_at
 
 
 def _starting(h: float, g: float, values: Array, variance: Array) -> Array:

@@ -48,14 +48,14 @@ def stored(figure: FigureOfMerit) -> dict[str, Any]:
 
 def of_reference(errors: xr.Dataset) -> NDArray[np.bool_]:
     """Return which points belong to the reference state, whose errors are 0 by definition, over `em.dims`."""
-    found = np.zeros(tuple(errors.sizes[dim] for dim in errors.em.dims), bool)
+    at_reference = np.zeros(tuple(errors.sizes[dim] for dim in errors.em.dims), bool)
     if "time" in errors.em.dims and "time" in errors.coords and "reference_interval" in errors.attrs:
         first, last = np.asarray(errors.attrs["reference_interval"], dtype=float)
         time = np.asarray(errors["time"].values, dtype=float)
         inside = (time >= first - 1e-6) & (time <= last + 1e-6)
         shape = [-1 if dim == "time" else 1 for dim in errors.em.dims]
-        found |= inside.reshape(shape)
-    return found
+        at_reference |= inside.reshape(shape)
+    return at_reference
 
 
 def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
@@ -63,7 +63,7 @@ def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
 
     An estimate of which only the reference state is known is unknown (NaN).
     """
-    found = []
+    values = []
     covariance = errors.em.covariance().values
     reference = of_reference(errors)
     for k, name in enumerate(errors.em.names):
@@ -76,8 +76,8 @@ def last_values(errors: xr.Dataset) -> list[FigureOfMerit]:
         value, U = float(error.values[last]), 2.0 * float(np.sqrt(covariance[last, k, k]))
         if reference[known].all():
             value = U = np.nan
-        found.append(FigureOfMerit(f"{name} after {minutes:.1f} min", value, U, error.attrs["units"]))
-    return found
+        values.append(FigureOfMerit(f"{name} after {minutes:.1f} min", value, U, error.attrs["units"]))
+    return values
 
 
 def beam_errors(errors: xr.Dataset) -> list[FigureOfMerit]:

@@ -121,15 +121,15 @@ class _Store(AbstractDataStore):
             raise
 
     def _read(self, file: h5py.File, path: str) -> None:
-        found = {name: file[name] for name in file}
-        if not all(isinstance(each, h5py.Dataset) for each in found.values()):
+        variables = {name: file[name] for name in file}
+        if not all(isinstance(each, h5py.Dataset) for each in variables.values()):
             raise _UnusualError
-        scales = {name: each for name, each in found.items() if h5py.h5ds.is_scale(each.id)}
+        scales = {name: each for name, each in variables.items() if h5py.h5ds.is_scale(each.id)}
         dims = {int(_numbers(each, "_Netcdf4Dimid", ())): name for name, each in scales.items()}
         self._attributes = _attributes(file, _OF_FILE)
         self._variables = {
             name.removeprefix(_RENAMED): self._variable(name, each, dims, path)
-            for name, each in found.items()
+            for name, each in variables.items()
             if name not in scales or not bytes(each.attrs.get("NAME", b"")).startswith(_NO_VALUES)
         }
 
@@ -177,14 +177,14 @@ def _numbers(variable: h5py.Dataset, name: str, shape: tuple[int, ...]) -> np.nd
     attribute = h5py.h5a.open(variable.id, name.encode())
     if attribute.shape != shape:
         raise _UnusualError
-    found = np.empty(shape, np.int32)
-    attribute.read(found)
-    return found
+    numbers = np.empty(shape, np.int32)
+    attribute.read(numbers)
+    return numbers
 
 
 def _attributes(owner: h5py.Dataset | h5py.File, hidden: set[str]) -> dict[str, Any]:
     """Return the attributes as h5netcdf does: an array with one value is this value."""
-    found = {}
+    attributes = {}
     for name in owner.attrs:
         if name in hidden:
             continue
@@ -193,8 +193,8 @@ def _attributes(owner: h5py.Dataset | h5py.File, hidden: set[str]) -> dict[str, 
             value = value.tolist()
         if isinstance(value, (bytes, h5py.Empty)) or (isinstance(value, np.ndarray) and value.dtype.kind == "S"):
             raise _UnusualError
-        found[name] = value[0] if isinstance(value, (list, np.ndarray)) and len(value) == 1 else value
-    return found
+        attributes[name] = value[0] if isinstance(value, (list, np.ndarray)) and len(value) == 1 else value
+    return attributes
 
 
 def _store(path: Path) -> AbstractDataStore:

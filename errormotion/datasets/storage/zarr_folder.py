@@ -115,8 +115,8 @@ def encoded(values: np.ndarray, metadata: Mapping[str, Any]) -> bytes:
 
 
 def _json(file: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(file.read_bytes())
-    return found
+    content: dict[str, Any] = json.loads(file.read_bytes())
+    return content
 
 
 def _known(name: str, metadata: Mapping[str, Any]) -> bool:
@@ -291,10 +291,10 @@ class _Array(BackendArray):
         self._check_size(len(content))
         return np.frombuffer(content, self.dtype).reshape(self.chunk)
 
-    def _check_size(self, found: int) -> None:
+    def _check_size(self, size: int) -> None:
         expected = math.prod(self.chunk) * self.dtype.itemsize
-        if found != expected:
-            raise ValueError(f"expected a chunk of {expected} bytes; found {found}")
+        if size != expected:
+            raise ValueError(f"expected a chunk of {expected} bytes; found {size}")
 
 
 def _decompressed(content: bytes, compressor: str) -> bytes:
@@ -304,8 +304,8 @@ def _decompressed(content: bytes, compressor: str) -> bytes:
     # Blosc itself trusts the length that a chunk states, and would read beyond its end.
     if compressor == "blosc" and (len(content) < 16 or struct.unpack_from("<I", content, 12)[0] != len(content)):
         raise ValueError(f"its {len(content)} bytes are not those that it states")
-    found: bytes = (from_blosc if compressor == "blosc" else from_zstd)(content)
-    return found
+    plain: bytes = (from_blosc if compressor == "blosc" else from_zstd)(content)
+    return plain
 
 
 def _texts(content: bytes, count: int) -> Iterator[str]:

@@ -224,12 +224,14 @@ class Circle3D(Shape):
     groups = (Group("centre", "position", 3), Group("normal", "direction", 3), Group("radius", "length"))
 
     def starts(self, q: Array) -> list[Array]:
-        found = []
+        starts = []
         for plane in Plane().starts(q):
             c, u = halves(plane)
             B = complement(u)
-            found = [self.settle(np.array([*(c + B @ flat[:2]), *u, flat[2]])) for flat in Circle().starts((q - c) @ B)]
-        return found
+            starts = [
+                self.settle(np.array([*(c + B @ flat[:2]), *u, flat[2]])) for flat in Circle().starts((q - c) @ B)
+            ]
+        return starts
 
     def residuals(self, theta: Array, q: Array) -> Array:
         h, rho, _ = about_axis(theta, q)

@@ -127,8 +127,8 @@ def read_entry(folder: Path) -> Entry:
     except (ValueError, RecursionError) as error:
         raise RunError(f"{file}: is not valid JSON ({error})", code="run.file.no_json") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        found = data.get("schema") if isinstance(data, dict) else type(data).__name__
-        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(found)[:MAX_TEXT]!r}", code="run.file.schema")
+        schema = data.get("schema") if isinstance(data, dict) else type(data).__name__
+        raise RunError(f"{file}: expected schema '{SCHEMA}'; found {str(schema)[:MAX_TEXT]!r}", code="run.file.schema")
     return Entry(
         folder.name,
         _text(data.get("created")),
@@ -156,25 +156,25 @@ def first_keys(text: str) -> dict[str, Any]:
     ValueError
         The text does not start like a JSON object.
     """
-    decode, found = json.JSONDecoder().raw_decode, dict[str, Any]()
+    decode, values = json.JSONDecoder().raw_decode, dict[str, Any]()
     at = _after(text, 0, "{")
     while True:
         try:
             name, at = decode(text, _after(text, at))
             start = at = _after(text, _after(text, at, ":"))
         except ValueError:
-            if not found:
+            if not values:
                 raise
-            return found
+            return values
         if not isinstance(name, str):
             raise ValueError(f"expected a key at character {at}")
         try:
-            found[name], at = decode(text, at)
+            values[name], at = decode(text, at)
             at = _after(text, at, ",")
         except ValueError:  # the end of the object, or where it is cut
-            if text[start : start + 1] == "[" and name not in found:
-                found[name] = _first_elements(text, start, decode)
-            return found
+            if text[start : start + 1] == "[" and name not in values:
+                values[name] = _first_elements(text, start, decode)
+            return values
 
 
 def _first_elements(text: str, at: int, decode: Callable[[str, int], tuple[Any, int]]) -> list[Any]:
@@ -227,12 +227,12 @@ def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
     """Return the figures of a JSON file; None if they are missing or damaged."""
     if not isinstance(data, list):
         return None
-    found = []
+    figures = []
     for entry in data[:MAX_FIGURES]:
         if not isinstance(entry, dict):
             return None
         limit = _number(entry.get("limit"))
-        found.append(
+        figures.append(
             FigureOfMerit(
                 _text(entry.get("name")),
                 _number(entry.get("value")),
@@ -241,7 +241,7 @@ def figures_from(data: Any) -> tuple[FigureOfMerit, ...] | None:
                 limit if math.isfinite(limit) else None,
             )
         )
-    return tuple(found)
+    return tuple(figures)
 
 
 def _hashes(data: Any) -> tuple[str, ...]:

@@ -20,17 +20,17 @@ def judge_runs(runs: Sequence[tuple[Path, Entry]], tolerances: Tolerances) -> li
 
     The decision on a run whose error dataset cannot be read, or is beyond `MAX_READ`, is open; ``failure`` states why.
     """
-    found = list[Conformity | None]()
+    conformities = list[Conformity | None]()
     read = 0
     for path, entry in runs:
         if not entry.errors:
-            found.append(None)
+            conformities.append(None)
         elif not tolerances.freedoms and entry.figures is not None:
-            found.append(judge_figures(entry.figures, tolerances))
+            conformities.append(judge_figures(entry.figures, tolerances))
         else:
             read += 1
-            found.append(_of_dataset(path / entry.errors, entry, tolerances, read > MAX_READ))
-    return found
+            conformities.append(_of_dataset(path / entry.errors, entry, tolerances, read > MAX_READ))
+    return conformities
 
 
 def _of_dataset(file: Path, entry: Entry, tolerances: Tolerances, too_many: bool) -> Conformity:

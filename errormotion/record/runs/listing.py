@@ -172,7 +172,7 @@ def _notes(
     start: datetime | None,
 ) -> tuple[tuple[Note, ...], list[str]]:
     """Return the notes on the chosen runs and on machines, and a sentence for each unreadable note."""
-    found = [
+    notes = [
         Note(events.instant(each.at) or entry.time, entry.machine, entry.folder, each.text, each.by, each.noted)
         for _, entry in chosen
         for each in entry.notes
@@ -182,14 +182,14 @@ def _notes(
     for path in sorted(path for path in noted if not (path / "run.json").exists()):
         made, wrong = events.read(path)
         damaged += wrong
-        found += [
+        notes += [
             Note(events.instant(each.at), each.machine, "", each.text, each.by, each.noted)
             for each in made
             if _same(machine, each.machine)
         ]
     if start is not None:
-        found = [note for note in found if note.time is not None and note.time >= start]
-    return tuple(sorted(found, key=lambda note: note.time or datetime.min.replace(tzinfo=UTC))), damaged
+        notes = [note for note in notes if note.time is not None and note.time >= start]
+    return tuple(sorted(notes, key=lambda note: note.time or datetime.min.replace(tzinfo=UTC))), damaged
 
 
 def _is_text(path: Path) -> bool:
@@ -211,8 +211,8 @@ def _stamp(folder: str) -> Stamp:
     return Stamp(status.st_mtime_ns, status.st_size, notes.st_mtime_ns, notes.st_size)
 
 
-def _order(found: tuple[Folder, Entry]) -> tuple[datetime, str]:
-    return found[1].time or datetime.min.replace(tzinfo=UTC), found[1].folder
+def _order(folder_and_entry: tuple[Folder, Entry]) -> tuple[datetime, str]:
+    return folder_and_entry[1].time or datetime.min.replace(tzinfo=UTC), folder_and_entry[1].folder
 
 
 def _same(wanted: str | None, found: str) -> bool:
@@ -238,7 +238,7 @@ def _complete(chosen: Iterable[tuple[Folder, Entry]]) -> int:
 
 def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
     """Return the folders of runs below paths, the names of their run folders, and whether these are all run folders."""
-    found: dict[Path, dict[str, None]] = {}
+    folders: dict[Path, dict[str, None]] = {}
     whole = set()
     count = 0
     for path in paths:
@@ -255,10 +255,10 @@ def _found(paths: Sequence[Path]) -> dict[Path, tuple[list[str], bool]]:
                 raise RunError(
                     f"{path}: expected at most {MAX_RUNS} runs; choose a folder with fewer runs", code="runs.too_many"
                 )
-            found.setdefault(parent, {})[name] = None
+            folders.setdefault(parent, {})[name] = None
             if not single:
                 whole.add(parent)
-    return {parent: (list(names), parent in whole) for parent, names in found.items()}
+    return {parent: (list(names), parent in whole) for parent, names in folders.items()}
 
 
 def _walk(path: Path, depth: int) -> Iterator[tuple[Path, str]]:
