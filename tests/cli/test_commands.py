@@ -288,6 +288,17 @@ def test_import_reports_its_result(run: Run, answer: Answer, tmp_path: Path) -> 
     run("import", "log.csv", "--map", "map.toml", "--out", "other.nc", code=1)
 
 
+def test_import_proposes_a_map(run: Run, answer: Answer, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("Zeit [s];T1 [C];T2 [C]\n0;20,1;21\n60;20,2;22\n120;20,3;23\n")
+    shown = run("import", "log.csv", "--propose", "map.toml").stdout
+    assert "temperature.T1" in shown
+    found = answer("import", "log.csv", "--map", "map.toml", "--out", "raw.nc")
+    assert found["sizes"] == {"time": 3, "sensor": 2, "source": 1}
+    run("import", "log.csv", "--propose", "map.toml", code=1)
+    run("import", "log.csv", "--map", "map.toml", code=2)
+    assert answer("import", "log.csv", "--propose", "other.toml")["schema"] == "errormotion.raw.monitor/1"
+
+
 def test_doctor_reports_valid_and_faulty_installations(
     run: Run, answer: Answer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

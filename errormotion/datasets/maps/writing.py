@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from errormotion.datasets.files import tomltext
-from errormotion.datasets.files.writing import create_bytes, replace_text
+from errormotion.datasets.files.writing import create_bytes, replace_text, writing
 from errormotion.datasets.maps.proposal import Proposal
 from errormotion.datasets.schemas import RawSchema, Row
+from errormotion.errors import DatasetError
 
 _WIDTH = 110
 """Number of characters from which a table has a line for each key."""
@@ -23,11 +24,17 @@ def write_map(proposal: Proposal, path: Path, *, overwrite: bool = False) -> Non
     DatasetError
         The file exists, or cannot be written.
     """
+    if not proposal.schema:
+        reason = "; ".join([*proposal.notes, *(question.text for question in proposal.questions)])
+        raise DatasetError(f"{', '.join(map(str, proposal.paths))}: no map can be proposed: {reason}", code="map.none")
     text = text_of(proposal)
     if overwrite:
         replace_text(path, text)
     else:
-        create_bytes(path, text.encode())
+        if path.exists():
+            raise DatasetError(f"{path}: exists; state another file for the map", code="map.exists")
+        with writing(path):
+            create_bytes(path, text.encode())
 
 
 def text_of(proposal: Proposal) -> str:

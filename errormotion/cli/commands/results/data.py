@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -229,26 +228,6 @@ def _identify_one(
             monte_carlo.show_evaluation(evaluation, file)
     if found is not None:
         end_with([found.plain()])
-
-
-def import_log(log: Path, map_file: Path, out: Path, as_json: bool) -> None:
-    """Convert a log with columns into a raw dataset."""
-    from errormotion.datasets.importing import import_log as read_log
-
-    with Bars(as_json) as bars:
-        bars.stage("importing")
-        raw = read_log(log, map_file, out)
-    sizes = {str(dim): size for dim, size in raw.sizes.items()}
-    missing, notes = json.loads(raw.attrs["missing_values"]), json.loads(raw.attrs.get("import_notes", "[]"))
-    if as_json:
-        answer = {"schema": raw.attrs["schema"], "sizes": sizes, "missing": missing, "notes": notes}
-        show_json({"ok": True, "raw": str(out), **answer})
-    else:
-        show(f"{out}: {raw.attrs['schema']}, " + ", ".join(f"{size} along {dim}" for dim, size in sizes.items()))
-        for column, count in missing.items():
-            show(f"  {column}: {count} empty cells, kept as NaN")
-        for note in notes:
-            show(f"  note: {note}")
 
 
 def report(

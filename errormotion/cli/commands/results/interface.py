@@ -56,15 +56,16 @@ def identify(
 
 @app.command("import")
 def import_(
-    log: Annotated[Path, typer.Argument(help="A log with columns: CSV or TSV.")],
-    map_: Annotated[Path, typer.Option("--map", help="A TOML file that describes the columns.")],
-    out: Annotated[Path, typer.Option(help="File of the raw dataset: .nc or .zarr.")],
+    logs: Annotated[list[Path], typer.Argument(help="A log with columns, a spreadsheet, or several of one dataset.")],
+    map_: Annotated[Path | None, typer.Option("--map", help="A TOML file that describes the columns.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File of the raw dataset: .nc or .zarr.")] = None,
+    propose: Annotated[Path | None, typer.Option(help="File of a proposed map that is written, to correct it.")] = None,
     json_: options.Json = False,
 ) -> None:
-    """Convert a log with columns into a raw dataset."""
-    from errormotion.cli.commands.results import data
+    """Convert logs with columns into a raw dataset, or propose a map for them."""
+    from errormotion.cli.commands.results import importing
 
-    data.import_log(log, map_, out, json_)
+    importing.import_logs(logs, map_, out, propose, json_)
 
 
 @app.command()
