@@ -9,13 +9,14 @@ import pytest
 from errormotion.compare.result import REPEATS, TABLE
 from errormotion.datasets.calibrations import inclination as calibration
 from errormotion.datasets.certificates import ITEMS
+from errormotion.datasets.maps.form import MapColumn, MapFile
 from errormotion.datasets.schemas import ERROR_ATTRIBUTES, ERROR_ROWS, RawSchema, Row, raw_schemas
+from errormotion.datasets.text.log_map import MappedLabels, MappedValue
 from errormotion.methods.spindle_drift.log_import.import_map import (
     Channel,
     Format,
     ImportMap,
     SpeedColumn,
-    TemperatureColumn,
     TimeColumn,
 )
 
@@ -69,9 +70,12 @@ def test_the_table_of_calibrations_is_the_schema() -> None:
 def test_the_reference_names_every_key_of_a_map() -> None:
     page = (DOCS / "reference" / "import-maps.md").read_text()
     reported = set(re.findall(r"[`.]([a-z_]+)`", page))
-    for table in (ImportMap, Format, TimeColumn, Channel, TemperatureColumn, SpeedColumn):
+    for table in (MapFile, MapColumn, MappedLabels, MappedValue, ImportMap, Format, TimeColumn, Channel, SpeedColumn):
         keys = {field.alias or name for name, field in table.model_fields.items()}
-        assert keys - {"format", "time", "channels", "temperatures", "spindle_speed"} <= reported
+        assert (
+            keys - {"format", "time", "channels", "temperatures", "spindle_speed", "columns", "units", "values"}
+            <= reported
+        )
 
 
 def test_the_table_of_attributes_is_the_schema() -> None:

@@ -111,6 +111,13 @@ def _table_expanded(data: Mapping[str, Any], schemas: Sequence[RawSchema]) -> di
         found["labels"] = {
             dim: entry if isinstance(entry, dict) else {"column": entry} for dim, entry in data["labels"].items()
         }
+    if isinstance(data.get("units"), dict):  # units.deviation.EXX
+        pairs = [
+            (f"{name}.{part}" if part else name, unit)
+            for name, entry in data["units"].items()
+            for part, unit in (entry.items() if isinstance(entry, dict) else [("", entry)])
+        ]
+        found["units"] = dict(pairs)
     if not isinstance(data.get("columns"), dict):
         return found
     stated = {*found.get("labels", {}), *(SEQUENCE if data.get("sequence") is not None else ()), "time"}
