@@ -50,7 +50,7 @@ def demo(
     ] = False,
     json_: options.Json = False,
 ) -> None:
-    """Measure a virtual machine and compare the result with the truth."""
+    """Measure a virtual machine and compare with the truth."""
     shown = COMPENSATED if compensate else CONTROLLERS
     if controller not in shown:
         raise UsageError(f"--controller {controller}: expected one of {', '.join(shown)}.", code="option.choice")
@@ -85,7 +85,7 @@ def dashboard(
         bool, typer.Option("--allow-control", help="Allow the pages to start and stop campaigns and compensations.")
     ] = False,
 ) -> None:
-    """Show runs and the instruments of a bench in a browser, until Ctrl-C."""
+    """Show runs and instruments in a browser, until Ctrl-C."""
     from errormotion.cli.commands import dashboard as command
 
     command.run(runs, bench, interval, host, port, name or [], cert, key, browser, campaigns, allow_control)

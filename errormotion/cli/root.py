@@ -18,8 +18,28 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 """The error of wrong options and arguments, which typer does not export."""
 
 
+SECTIONS = {
+    "Measure": ("demo", "init", "plan", "program", "run", "background", "monitor", "calibrate", "bench", "doctor"),
+    "Evaluate": ("add", "identify", "report", "open", "compare", "export", "validate", "dashboard"),
+    "Keep a record": ("runs", "history", "note"),
+    "Improve the machine": ("model", "compensate"),
+}
+"""Sections of the first help page with their commands, in the order of their use; the others stand below by name."""
+
+
 class _Commands(TyperGroup):
     """All commands; after ``--json``, unknown options and arguments too are reported as a JSON document."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands in `SECTIONS`, and the names of all others."""
+        others = [name for name in self.list_commands(ctx) if name not in sum(SECTIONS.values(), ())]
+        # 6: the indentation, and the space between a name and its text
+        room = formatter.width - 6 - max(map(len, sum(SECTIONS.values(), ())))
+        for title, names in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(room)) for name in names])
+        with formatter.section("For scripts and developers, see 'errormotion COMMAND --help'"):
+            formatter.write_text(", ".join(others))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ctx.meta[__name__] = "--json" in args
@@ -64,4 +84,4 @@ plugins_app = _group("plugins", "Instruments, methods and kinds of dataset.")
 bench_app = _group("bench", "Check a bench file, or the instruments of a bench.")
 model_app = _group("model", "Thermal models: errors predicted from temperatures.")
 compensate_app = _group("compensate", "Compensate measured errors.")
-background_app = _group("background", "Campaigns that 'errormotion run --detach' or the dashboard has started.")
+background_app = _group("background", "Campaigns that run by themselves (run --detach, dashboard).")

@@ -13,6 +13,7 @@ import xarray as xr
 from command_line import Result
 
 from errormotion import datasets, plugins
+from errormotion.cli.root import SECTIONS
 from errormotion.plugins.contracts import Status
 
 Run = Callable[..., Result]
@@ -54,8 +55,10 @@ def test_what_scipy_asks_numpy_for_is_loaded_when_it_is_used() -> None:
 
 def test_module_is_the_command() -> None:
     result = python("-m", "errormotion", "--help")
-    for name in ("demo", "plugins", "bench", "run", "identify", "import", "report", "validate", "doctor"):
+    for name in sum(SECTIONS.values(), ()):
         assert f"\n  {name} " in result.stdout
+    assert "import" in result.stdout
+    assert "...\n" not in result.stdout.partition("Measure:")[2]  # no sentence is cut
 
 
 def test_unknown_commands_and_options_are_usage_errors(run: Run) -> None:
@@ -311,6 +314,27 @@ def test_doctor_reports_valid_and_faulty_installations(
 
 
 BENCH = ROOT / "examples" / "virtual_cframe" / "bench.toml"
+
+
+def test_several_files_are_validated_and_reported_at_once(run: Run, answer: Answer, raw: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.nc").write_bytes(raw.read_bytes()[:400])
+    found = answer("validate", raw, "cut.nc", code=3)["files"]
+    assert [bool(each["violations"]) for each in found] == [False, True]
+    text = run("validate", raw, "cut.nc", code=3).stdout
+    assert "raw.nc: valid" in text
+    assert "cut.nc: 1 violation" in text
+    for name in ("a.nc", "b.nc"):
+        run("identify", raw, "--out", name)
+    pages = [each["report"] for each in answer("report", "a.nc", "b.nc")["reports"]]
+    assert pages == ["a.html", "b.html"]
+    assert "expected one run; found 2" in run("report", "a.nc", "b.nc", "--out", "c.html", code=2).stderr
+
+
+def test_a_folder_without_a_run_names_the_runs_in_it(run: Run, tmp_path: Path) -> None:
+    assert "expected a run folder with a run.json; found none" in run("report", ".", code=1).stderr
+    (tmp_path / "first").mkdir()
+    (tmp_path / "first" / "run.json").write_text("{}")
+    assert "found the folders of runs first" in run("report", ".", code=1).stderr
 
 
 def test_bench_validate_opens_nothing(run: Run, answer: Answer, tmp_path: Path) -> None:

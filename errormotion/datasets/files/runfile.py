@@ -111,6 +111,16 @@ class State(dict[str, Any]):
         raise RunError(f"{self.file}: expected the key '{key}'; found none", code="run.file.key.missing")
 
 
+def _instead(folder: Path, error: OSError) -> str:
+    """Return what is found instead of a ``run.json`` that cannot be read."""
+    if not isinstance(error, FileNotFoundError):
+        return str(error.strerror)
+    if not folder.is_dir():
+        return "there is no such folder"
+    runs = sorted(each.parent.name for each in folder.glob(f"*/{FILE}"))
+    return f"found the folders of runs {', '.join(runs[:3])}" + (" ..." if runs[3:] else "") if runs else "found none"
+
+
 def read_run(folder: Path) -> State:
     """Return the content of the ``run.json`` of a folder.
 
@@ -125,7 +135,7 @@ def read_run(folder: Path) -> State:
         content = parse_json(read_bytes(file, MAX_FILE))
     except OSError as error:
         raise RunError(
-            f"{folder}: expected a run folder with a {FILE}; {error.strerror}", code="run.folder.not_found"
+            f"{folder}: expected a run folder with a {FILE}; {_instead(folder, error)}", code="run.folder.not_found"
         ) from error
     except ValueError as error:
         raise RunError(

@@ -36,7 +36,10 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Replace files that exist.")] = False,
     json_: options.Json = False,
 ) -> None:
-    """Write a bench and a campaign file; on a terminal, ask for what is not stated."""
+    """Write a bench and a campaign file; ask for what is open.
+
+    Questions are asked on a terminal only.
+    """
     from errormotion.cli.commands.campaigns.init import command
 
     command.init(
@@ -122,7 +125,7 @@ def plan(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="A file for the plan of one test.")] = None,
     json_: options.Json = False,
 ) -> None:
-    """Report the expected uncertainty of the tests of a campaign, and how to reduce it."""
+    """Report expected uncertainties, and how to reduce them."""
     from errormotion.cli.commands.campaigns import plan as command
 
     command.expect(campaign, test, out, json_)

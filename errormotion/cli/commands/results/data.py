@@ -11,7 +11,7 @@ import typer
 
 from errormotion import datasets, plugins
 from errormotion.campaign.storage.raw_paths import is_runs_folder, raw_of
-from errormotion.cli.guard import ERROR, INTERNAL, log_file
+from errormotion.cli.guard import ERROR, INTERNAL, UsageError, log_file
 from errormotion.cli.options import read_settings
 from errormotion.cli.output import failure, show, show_json, working
 from errormotion.cli.page import new_files
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from errormotion.campaign.batch import Outcome
+    from errormotion.report import Form
+    from errormotion.tolerances.conformity import Conformity
 
 
 class Trials(NamedTuple):
@@ -231,7 +233,7 @@ def _identify_one(
 
 
 def report(
-    run: Path,
+    runs: list[Path],
     out: Path | None,
     tolerances: Path | None,
     as_json: bool,
@@ -240,44 +242,60 @@ def report(
     paper: str = "",
     also: tuple[str, ...] = (),
 ) -> None:
-    """Write the report of a run folder or of one file of errors, and decide on the tolerances."""
+    """Write the reports of run folders or of files of errors, and decide on the tolerances."""
+    from errormotion.report import Form
+
+    if out is not None and len(runs) > 1:
+        raise UsageError(f"--out {out}: expected one run; found {len(runs)}", code="option.combination")
+    limits = load_tolerances(tolerances) if tolerances is not None else None
+    form, documents = Form(language, paper, also), list[dict[str, Any]]()
+    for run in runs:
+        page, found = (_report_run if run.is_dir() else _report_errors)(run, out, limits, form)
+        files = [str(each) for each in form.beside(page)]
+        plain = found.plain() if found is not None else None
+        documents.append({"report": str(page), "files": files, "conformity": plain})
+        if not as_json:
+            for line in (*(lines_of(found) if found is not None else []), str(page), *files):
+                show(line)
+    if as_json:
+        show_json({"ok": True, **(documents[0] if len(runs) == 1 else {"reports": documents})})
+    if decided := [each["conformity"] for each in documents if each["conformity"] is not None]:
+        end_with(decided)
+
+
+def _report_run(run: Path, out: Path | None, limits: Tolerances | None, form: Form) -> tuple[Path, Conformity | None]:
+    """Write the report of a run folder; return the page and the decision on the tolerances."""
     from errormotion.campaign.folder import RunFolder
-    from errormotion.report import Form, write_report, write_run_report
+    from errormotion.report import write_run_report
+
+    folder, found = RunFolder.open(run), None
+    stored = limits or from_run(folder.data)
+    if stored is not None and folder.errors is not None:
+        with reading(folder.errors), datasets.load(folder.errors) as errors:
+            datasets.validate(errors)
+            found = judge(errors, stored)
+        folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
+    with working("Writing the report"), reading(run):
+        page = write_run_report(run, out, form=form)
+    if out is None:
+        folder.data["report"] = page.relative_to(folder.path).as_posix()
+        folder.step("report", "done")
+        folder.save()
+    return page, found
+
+
+def _report_errors(
+    file: Path, out: Path | None, limits: Tolerances | None, form: Form
+) -> tuple[Path, Conformity | None]:
+    """Write the report of a file of errors; return the page and the decision on the tolerances."""
+    from errormotion.report import write_report
     from errormotion.report.write import belonging
 
-    limits = load_tolerances(tolerances) if tolerances is not None else None
-    found, form = None, Form(language, paper, also)
-    if run.is_dir():
-        folder = RunFolder.open(run)
-        stored = limits or from_run(folder.data)
-        if stored is not None and folder.errors is not None:
-            with reading(folder.errors), datasets.load(folder.errors) as errors:
-                datasets.validate(errors)
-                found = judge(errors, stored)
-            folder.save(tolerances=stored.model_dump(mode="json"), conformity=found.plain())
-        with working("Writing the report"), reading(run):
-            path = write_run_report(run, out, form=form)
-        if out is None:
-            folder.data["report"] = path.relative_to(folder.path).as_posix()
-            folder.step("report", "done")
-            folder.save()
-    else:
-        with working("Writing the report"), reading(run), datasets.load(run) as errors, explained(run, errors):
-            state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
-            page = out or run.with_suffix(".html")
-            path = write_report([errors, *belonging(errors, run)], page, run=state, form=form)
-            found = judge(errors, limits) if limits is not None else None
-    if as_json:
-        files = [str(each) for each in form.beside(path)]
-        plain = found.plain() if found is not None else None
-        show_json({"ok": True, "report": str(path), "files": files, "conformity": plain})
-    else:
-        for line in lines_of(found) if found is not None else []:
-            show(line)
-        for each in (path, *form.beside(path)):
-            show(str(each))
-    if found is not None:
-        end_with([found.plain()])
+    with working("Writing the report"), reading(file), datasets.load(file) as errors, explained(file, errors):
+        state = {"tolerances": limits.model_dump(mode="json")} if limits is not None else None
+        page = out or file.with_suffix(".html")
+        page = write_report([errors, *belonging(errors, file)], page, run=state, form=form)
+        return page, judge(errors, limits) if limits is not None else None
 
 
 def validate(file: Path) -> list[str]:

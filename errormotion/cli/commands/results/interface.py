@@ -70,8 +70,10 @@ def import_(
 
 @app.command()
 def report(
-    run: Annotated[Path, typer.Argument(help="A run folder, or a NetCDF file of errors.")],
-    out: Annotated[Path | None, typer.Option(help="File of the page; default: report.html in the run folder.")] = None,
+    run: Annotated[list[Path], typer.Argument(help="Run folders, or NetCDF files of errors.")],
+    out: Annotated[
+        Path | None, typer.Option(help="File of the page of one run; default: report.html in the run folder.")
+    ] = None,
     tolerances: options.Tolerances = None,
     pdf: options.Pdf = False,
     csv: Annotated[bool, typer.Option("--csv", help="Write every table as CSV into a folder beside the page.")] = False,
@@ -84,7 +86,7 @@ def report(
     ] = None,
     json_: options.Json = False,
 ) -> None:
-    """Write the report of a run."""
+    """Write the reports of runs."""
     from errormotion.cli.commands.results import data
 
     also = tuple(name for name, wanted in (("xlsx", xlsx), ("csv", csv), ("pdf", pdf)) if wanted)
@@ -93,20 +95,24 @@ def report(
 
 @app.command()
 def validate(
-    file: Annotated[Path, typer.Argument(help="A dataset (.nc, .zarr), a run folder, a bench or a campaign file.")],
+    file: Annotated[
+        list[Path], typer.Argument(help="Datasets (.nc, .zarr), run folders, bench, campaign or tolerance files.")
+    ],
     json_: options.Json = False,
 ) -> None:
-    """Check that a file follows its schema, and list every violation."""
+    """Check that files follow their schema; list every violation."""
     from errormotion.cli.commands.results import data
 
-    mistakes = data.validate(file)
+    mistakes = {str(each): data.validate(each) for each in file}
+    every = [text for texts in mistakes.values() for text in texts]
     if json_:
-        error = failure("\n".join(mistakes), code="file.violations") if mistakes else {}
-        show_json({"ok": not mistakes, "file": str(file), "violations": mistakes, **error})
-    else:
-        count = f"{len(mistakes)} violation" + ("s" if len(mistakes) != 1 else "")
-        show("\n  - ".join([f"{file}: {count}", *data.alike(mistakes)]) if mistakes else f"{file}: valid")
-    if mistakes:
+        error = failure("\n".join(every), code="file.violations") if every else {}
+        found = [{"file": each, "violations": texts} for each, texts in mistakes.items()]
+        show_json({"ok": not every, **(found[0] if len(found) == 1 else {"files": found}), **error})
+    for each, texts in mistakes.items() if not json_ else ():
+        count = f"{len(texts)} violation" + ("s" if len(texts) != 1 else "")
+        show("\n  - ".join([f"{each}: {count}", *data.alike(texts)]) if texts else f"{each}: valid")
+    if every:
         raise typer.Exit(INVALID)
 
 
@@ -157,7 +163,7 @@ def compare(
     language: options.Language = None,
     json_: options.Json = False,
 ) -> None:
-    """Compare results of one machine: whether they agree, and possible causes of differences."""
+    """Compare results of one machine, and explain differences."""
     from errormotion.cli.commands.results import compare as command
 
     origins = {}
@@ -192,7 +198,10 @@ def export(
     k: Annotated[float, typer.Option("-k", min=0, max=10, help="Coverage factor of the uncertainties.")] = 2.0,
     json_: options.Json = False,
 ) -> None:
-    """Write the tables of a result for a spreadsheet, in um and arcsec, or the dataset as NetCDF or Zarr."""
+    """Write the tables of a result, or the dataset, to a file.
+
+    Tables are for spreadsheets, in um and arcsec; the dataset is NetCDF or Zarr.
+    """
     from errormotion.cli.commands.results import export as command
 
     command.export(result, out, options.parts(freedoms) or None, options.optional_point("--at", at), k, json_)

@@ -25,7 +25,7 @@ def runs(
     ] = None,
     json_: options.Json = False,
 ) -> None:
-    """List the runs of folders, newest first, each with its figure of merit."""
+    """List runs, newest first, each with its figure of merit."""
     from errormotion.cli.commands.runs import listing as command
 
     command.runs(folders or [], machine, method, since, tolerances, json_)
@@ -55,7 +55,7 @@ def add(
     again: Annotated[bool, typer.Option("--again", help="Add files once more that are in the record.")] = False,
     json_: options.Json = False,
 ) -> None:
-    """Add files of other software to the record: import, identify and report them."""
+    """Add files of other software: import, identify, report."""
     from errormotion.cli.commands.runs import add as command
     from errormotion.record.adding.add import Request
 
@@ -117,7 +117,10 @@ def history(
     language: options.Language = None,
     json_: options.Json = False,
 ) -> None:
-    """Show a figure of merit of a machine over time: trend, steps, control limits, notes."""
+    """Show a figure of merit over time: trend, steps, limits.
+
+    Control limits follow from the runs; notes on the machine stand beside them.
+    """
     from errormotion.cli.commands.runs import history as command
 
     page = page_of(report, pdf, paper, language)
