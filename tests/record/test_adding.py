@@ -10,8 +10,9 @@ from errormotion import datasets, plugins
 from errormotion.datasets import provenance
 from errormotion.plugins import MethodSubject
 from errormotion.record.adding import machines
-from errormotion.record.adding.add import Request, add
+from errormotion.record.adding.add import add
 from errormotion.record.adding.questions import take_proposals
+from errormotion.record.adding.request import Request
 from errormotion.report import write_run_report
 
 SLOW = {"crossbeam_scan", "multilateration", "spindle_drift"}

@@ -11,7 +11,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,68 +25,22 @@ from errormotion.campaign.runner import identify_run, report_run, settings_hash
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.datasets import provenance
 from errormotion.datasets.files.tomlfile import read_toml
-from errormotion.datasets.files.writing import replace_bytes
+from errormotion.datasets.maps.questions import Question
 from errormotion.errors import DatasetError, RunError, code_of
 from errormotion.plugins import Method
 from errormotion.record.adding.machines import remember
-from errormotion.record.adding.originals import KEPT, MAP, Original, keep, originals_of, run_of
-from errormotion.record.adding.questions import Ask, Choice, Question
-from errormotion.record.adding.reading import is_raw, owner_of, read_raw
+from errormotion.record.adding.mapping import MapOfFiles, map_of_files, of_machine
+from errormotion.record.adding.originals import KEPT, Original, keep, originals_of, run_of
+from errormotion.record.adding.questions import Ask
+from errormotion.record.adding.reading import owner_of, read_raw
+from errormotion.record.adding.request import Request
 from errormotion.record.adding.statement import Statement, copy_logo, load_statement
-from errormotion.record.runs.listing import list_runs
 from errormotion.tolerances.table import load_tolerances
 
 log = logging.getLogger(__name__)
 
 MAX_NAME = 40
 """Longest part of the name of a run folder that comes from a file, characters."""
-MAX_CHOICES = 20
-"""Largest number of machines that are offered."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is added, and what is stated about it; empty texts are not stated.
-
-    Attributes
-    ----------
-    files : tuple of Path
-        Files of one measurement.
-    runs : Path
-        The folder of runs.
-    machine, method, axis : str
-        Name of the machine, id of the method, axis that moved.
-    measured : str
-        Start of the measurement, ISO 8601, where the files do not state it.
-    test : str
-        Name of the test; by default method and axis.
-    map : Path, optional
-        The map of the files.
-    head : Path, optional
-        File of the statements for the head of the report.
-    tolerances : Path, optional
-        File of limits.
-    settings : callable
-        ``settings(model)`` returns the checked settings of the method.
-    answers : mapping of str to str
-        Answers to questions, by their keys.
-    again : bool
-        Whether files that are in the record become another run.
-    """
-
-    files: tuple[Path, ...]
-    runs: Path
-    machine: str = ""
-    method: str = ""
-    axis: str = ""
-    measured: str = ""
-    test: str = ""
-    map: Path | None = None
-    head: Path | None = None
-    tolerances: Path | None = None
-    settings: Callable[[Any], Any] = lambda model: model()
-    answers: Mapping[str, str] = field(default_factory=dict)
-    again: bool = False
 
 
 @dataclass(frozen=True)
@@ -152,7 +106,7 @@ def add(
             stage("writing the report")
             report_run(folder, report)
         folder.save(status="finished", reason="")
-    remember(request.runs, str(folder.data["bench"]["machine"]), work.schema, work.answered)
+    remember(request.runs, str(folder.data["bench"]["machine"]), work.schema, work.map.answers)
     return Added(folder, known=False, notes=work.notes)
 
 
@@ -170,7 +124,7 @@ class _Adding:
         self.owner: Any = None
         self.settings: Any = None
         self.schema = ""
-        self.answered: dict[str, str] = {}
+        self.map = MapOfFiles()
         self.notes: tuple[str, ...] = ()
 
     def fill(self, folder: Path) -> dict[str, Any]:
@@ -178,14 +132,14 @@ class _Adding:
         self.stage("copying the files")
         copies = keep(self.originals, folder)
         self.stage("reading the files")
-        map_file = self._map(copies, folder)
-        raw = read_raw(copies, map_file)
         with _about(self.request.files):
+            self.map = map_of_files(self.request, copies, folder, self.ask)
+            raw = read_raw(copies, self.map.file)
             self.owner = owner_of(raw)
-            raw = self._stated(raw, map_file is not None)
-            entries = self._entries(raw, map_file)
+            raw = self._stated(raw)
+            entries = self._entries(raw)
         self.schema = str(raw.attrs["schema"])
-        self.notes = tuple(json.loads(str(raw.attrs.get("import_notes") or "[]")))
+        self.notes = (*self.map.notes, *json.loads(str(raw.attrs.get("import_notes") or "[]")))
         self.stage("storing the raw data")
         datasets.save(raw, folder / "raw.zarr", overwrite=True)
         raw.close()
@@ -193,22 +147,7 @@ class _Adding:
             copy_logo(self.statement, self.request.head, folder)
         return entries
 
-    def _map(self, copies: Sequence[Path], folder: Path) -> Path | None:
-        """Return the map in the folder; None for files that need none."""
-        map_file = folder / MAP
-        if self.request.map is not None:
-            replace_bytes(map_file, self.request.map.read_bytes())
-            return map_file
-        if all(is_raw(copy) for copy in copies):
-            return None
-        if map_file.exists():
-            return map_file
-        raise DatasetError(
-            f"{self.request.files[0]}: states no raw schema; describe its columns by a map: --map FILE",
-            code="add.map.missing",
-        )
-
-    def _stated(self, raw: xr.Dataset, mapped: bool) -> xr.Dataset:
+    def _stated(self, raw: xr.Dataset) -> xr.Dataset:
         """Return the raw data with what was stated about them.
 
         Raises
@@ -219,13 +158,16 @@ class _Adding:
         request = self.request
         found = {"imported": ", ".join(each.name for each in self.originals.values())}
         stated = str(raw.attrs.get("machine", "")).replace("unknown", "")
-        known = "" if mapped else stated
+        known = "" if self.map.file is not None else stated
         if request.machine and known and request.machine.casefold() != known.casefold():
             raise DatasetError(
                 f"--machine {request.machine}: the data are of the machine '{known}'; omit the option",
                 code="add.machine.contradiction",
             )
-        found["machine"] = known or request.machine or stated or self._asked_machine()
+        found["machine"] = known or request.machine or stated
+        if not found["machine"]:
+            question = of_machine(Question("machine", "", (), "", True), request.runs)
+            found["machine"] = self.ask([question])["machine"]
         if request.axis:
             axis = str(raw.attrs.get("axis", request.axis))
             if axis != request.axis:
@@ -242,17 +184,7 @@ class _Adding:
             found["instruments"] = json.dumps(self.statement.records(), ensure_ascii=False)
         return raw.assign_attrs(found)
 
-    def _asked_machine(self) -> str:
-        machines = [name for name in _machines(self.request.runs) if name][:MAX_CHOICES]
-        question = Question(
-            "machine",
-            "On which machine was this measured?",
-            tuple(Choice(name, name) for name in machines),
-            machines[0] if len(machines) == 1 else "",
-        )
-        return self.ask([question])["machine"]
-
-    def _entries(self, raw: xr.Dataset, map_file: Path | None) -> dict[str, Any]:
+    def _entries(self, raw: xr.Dataset) -> dict[str, Any]:
         request, owner = self.request, self.owner
         start, source = _start(raw, request.files)
         entries = first_entries() | {
@@ -261,7 +193,7 @@ class _Adding:
             "bench": {"machine": raw.attrs["machine"]},
             KEPT: {
                 "files": [each.plain() for each in self.originals.values()],
-                "map": map_file.name if map_file is not None else None,
+                "map": self.map.file.name if self.map.file is not None else None,
             },
             "created": start,
             "created_from": source,
@@ -303,10 +235,6 @@ def _component(folder: RunFolder) -> str:
     """Return the component to which the errors of a run belong, such as an axis."""
     with datasets.load(folder.errors or folder.path) as errors:
         return str(errors.attrs["component"])
-
-
-def _machines(runs: Path) -> Sequence[str]:
-    return list_runs([runs]).machines if runs.is_dir() else ()
 
 
 def _start(raw: xr.Dataset, files: Sequence[Path]) -> tuple[str, str]:

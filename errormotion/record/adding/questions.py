@@ -1,65 +1,65 @@
-"""Questions on a file, and their answers."""
+"""Questions on files, and who answers them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
+from errormotion.datasets.maps.questions import Question
 from errormotion.errors import DatasetError
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A possible answer, and what it means."""
+class Ask(Protocol):
+    """Answers questions."""
 
-    value: str
-    text: str
+    def __call__(self, questions: Sequence[Question], mistake: str = "") -> Mapping[str, str]:
+        """Return answers to one or several of the questions, by their keys; those that remain are asked again.
 
-
-@dataclass(frozen=True)
-class Question:
-    """A question; without choices the answer is a text. ``proposed`` is the answer of a script, empty for none."""
-
-    key: str
-    text: str
-    choices: tuple[Choice, ...] = ()
-    proposed: str = ""
-    needed: bool = True
+        An empty text leaves a question unanswered that is not needed. ``mistake`` states what was wrong with the answer
+        before.
+        """
 
 
-Ask = Callable[[Sequence[Question]], Mapping[str, str]]
-"""Returns an answer to each question by its key; an empty text leaves a question that is not needed unanswered."""
+OPTIONS = {"machine": "--machine NAME", "attributes.axis": "--axis AXIS"}
+"""Options of ``errormotion add`` for answers; all others are stated by ``--set``."""
 
 
-def take_proposals(questions: Sequence[Question]) -> dict[str, str]:
-    """Return the proposed answers.
+def take_proposals(questions: Sequence[Question], mistake: str = "") -> dict[str, str]:
+    """Return the proposed answer to the first question.
 
     Raises
     ------
     DatasetError
-        Nothing is proposed for a question that must be answered.
+        Nothing is proposed for questions that must be answered; all are listed.
     """
-    refuse([each for each in questions if each.needed and not each.proposed])
-    return {each.key: each.proposed for each in questions}
+    refuse([each for each in questions if each.needed and not each.proposed], mistake)
+    return {questions[0].key: questions[0].proposed}
 
 
-def refuse(questions: Sequence[Question]) -> None:
-    """Raise DatasetError if there is a question, and state how to answer each."""
-    if questions:
-        lines = [f"{option(each)}: {each.text}{_known(each)}" for each in questions]
-        what = "An answer is" if len(lines) == 1 else f"{len(lines)} answers are"
-        raise DatasetError(
-            "\n  - ".join([f"{what} missing; nothing was added. State with:", *lines]), code="add.answers.missing"
-        )
+def refuse(questions: Sequence[Question], mistake: str = "") -> dict[str, str]:
+    """Raise an error that states how to answer each of the questions by an option; no answers without questions.
+
+    Raises
+    ------
+    DatasetError
+        There is a question, or a proposed answer was wrong.
+    """
+    if mistake:
+        raise DatasetError(mistake, code="map.answer")
+    if not questions:
+        return {}
+    lines = [f"{OPTIONS.get(each.key, f'--set {each.key}=VALUE')}: {_described(each)}" for each in questions]
+    what = "1 answer is missing" if len(lines) == 1 else f"{len(lines)} answers are missing"
+    takes = " --yes takes what is proposed." if any(each.proposed for each in questions) else ""
+    raise DatasetError("\n  - ".join([f"{what}; nothing was added.{takes}", *lines]), code="add.answers.missing")
 
 
-def option(question: Question) -> str:
-    """Return the option of ``errormotion add`` that answers a question."""
-    known = {"machine": "--machine NAME", "attributes.axis": "--axis AXIS"}
-    return known.get(question.key, f"--set {question.key}=VALUE")
-
-
-def _known(question: Question) -> str:
-    choices = ", ".join(each.value for each in question.choices)
-    proposed = f" Proposed: {question.proposed}." if question.proposed else ""
-    return (f" One of {choices}." if choices else "") + proposed
+def _described(question: Question) -> str:
+    parts = [question.text]
+    if question.choices:
+        parts.append("one of " + ", ".join(each.value for each in question.choices))
+    if question.proposed:
+        parts.append(f"proposed: {question.proposed}")
+    elif not question.needed:
+        parts.append("may be omitted")
+    return "; ".join(parts)

@@ -10,7 +10,7 @@ from typing import Any
 import xarray as xr
 
 from errormotion import datasets, plugins
-from errormotion.datasets.importing import _reader
+from errormotion.datasets.importing import import_files
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
 
@@ -39,9 +39,7 @@ def read_raw(paths: Sequence[Path], map_file: Path | None) -> xr.Dataset:
         The map or a file is wrong, the file has results instead of raw data, or there are several without a map.
     """
     if map_file is not None:
-        raw = _reader(map_file)(paths[0], map_file)
-        datasets.validate(raw)
-        return raw
+        return import_files(paths, map_file)
     if len(paths) != 1:
         names = ", ".join(path.name for path in paths)
         raise DatasetError(

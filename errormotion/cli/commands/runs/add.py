@@ -13,15 +13,26 @@ from errormotion.cli.options import read_settings
 from errormotion.cli.output import show, show_json
 from errormotion.cli.progress import Bars, on_terminal
 from errormotion.cli.tolerances import end_with, remarks
-from errormotion.record.adding.add import Added, Request
+from errormotion.datasets.maps.questions import Question
+from errormotion.record.adding.add import Added
 from errormotion.record.adding.add import add as add_files
-from errormotion.record.adding.questions import Ask, Question, refuse, take_proposals
+from errormotion.record.adding.questions import Ask, refuse, take_proposals
+from errormotion.record.adding.request import Request
+
+_OF_MAP = ("columns.", "units.", "values.", "attributes.", "format.", "raw=")
+"""Start of the assignments that answer questions on the files; others are settings of the method."""
 
 
 def add(request: Request, assignments: Sequence[str], yes: bool, as_json: bool) -> None:
     """Add the files of a request to the record, and print the results."""
-    request = replace(request, settings=lambda model: read_settings(model, None, assignments))
-    ask: Ask = take_proposals if yes else _asked if on_terminal() and not as_json else _refused
+    answers = [each for each in assignments if each.startswith(_OF_MAP)]
+    settings = [each for each in assignments if each not in answers]
+    request = replace(
+        request,
+        settings=lambda model: read_settings(model, None, settings),
+        answers={key.strip(): text.strip() for key, _, text in (each.partition("=") for each in answers)},
+    )
+    ask: Ask = take_proposals if yes else _asked if on_terminal() and not as_json else refuse
     with Bars(as_json) as bars:
         added = add_files(request, ask, report=report_of_run, stage=bars.stage)
     conformity = added.folder.data.get("conformity")
@@ -44,29 +55,25 @@ def _lines(added: Added, files: Sequence[Path]) -> list[str]:
     return [f"{names}: {test} of {machine}, in {folder.path}", *(f"  {line}" for line in lines), *remarks(decided)]
 
 
-def _refused(questions: Sequence[Question]) -> Mapping[str, str]:
-    """Raise an error that states how to answer the questions by options: nobody can be asked."""
-    refuse(questions)
-    return {}
-
-
-def _asked(questions: Sequence[Question]) -> Mapping[str, str]:
-    """Return the answers of a person; choices are numbered."""
-    answers = {}
-    for each in questions:
-        show(each.text, err=True)
-        values = [choice.value for choice in each.choices]
-        for number, choice in enumerate(each.choices, 1):
-            meaning = "" if choice.text == choice.value else f": {choice.text}"
-            show(f"  {number}  {choice.value}{meaning}", err=True)
-        default = str(values.index(each.proposed) + 1) if each.proposed in values else each.proposed
-        answer = ""
-        while not answer:
-            answer = str(typer.prompt("Number or text" if values else "Answer", default=default, err=True)).strip()
-            if not each.needed:
-                break
-        answers[each.key] = values[int(answer) - 1] if _is_number(answer, len(values)) else answer
-    return answers
+def _asked(questions: Sequence[Question], mistake: str = "") -> Mapping[str, str]:
+    """Return the answer of a person to the first question; choices are numbered."""
+    question = questions[0]
+    if mistake:
+        show(mistake, err=True)
+    values = [choice.value for choice in question.choices]
+    show(f"\n{question.text}", err=True)
+    for number, choice in enumerate(question.choices, 1):
+        meaning = "" if choice.text == choice.value else f": {choice.text}"
+        show(f"  {number}  {choice.value}{meaning}", err=True)
+    default = str(values.index(question.proposed) + 1) if question.proposed in values else question.proposed
+    prompt = "Number" if values else "Answer"
+    prompt += "" if question.needed else " (may be left empty)"
+    answer = ""
+    while not answer:
+        answer = str(typer.prompt(prompt, default=default, show_default=bool(default), err=True)).strip()
+        if not question.needed:
+            break
+    return {question.key: values[int(answer) - 1] if _is_number(answer, len(values)) else answer}
 
 
 def _is_number(answer: str, count: int) -> bool:

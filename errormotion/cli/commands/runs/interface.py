@@ -57,7 +57,7 @@ def add(
 ) -> None:
     """Add files of other software: import, identify, report."""
     from errormotion.cli.commands.runs import add as command
-    from errormotion.record.adding.add import Request
+    from errormotion.record.adding.request import Request
 
     start = options.date("--measured", measured)
     request = Request(

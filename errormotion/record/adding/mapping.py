@@ -1,0 +1,150 @@
+"""The map of added files: stated, of earlier files of the same kind, or proposed with the answers of a person."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from errormotion import plugins
+from errormotion.datasets.files.reading import leaves
+from errormotion.datasets.files.tomlfile import read_toml
+from errormotion.datasets.files.tomltext import value_of
+from errormotion.datasets.files.writing import replace_bytes
+from errormotion.datasets.maps.known import known_map
+from errormotion.datasets.maps.proposal import Choice, Proposal, Question, propose
+from errormotion.datasets.maps.writing import write_map
+from errormotion.datasets.schemas import RawSchema
+from errormotion.errors import DatasetError
+from errormotion.record.adding.machines import load_machines
+from errormotion.record.adding.originals import MAP
+from errormotion.record.adding.questions import Ask
+from errormotion.record.adding.reading import is_raw
+from errormotion.record.adding.request import Request
+from errormotion.record.runs.listing import list_runs
+
+MAX_MAPS = 200
+"""Largest number of maps of earlier runs that are tried."""
+MAX_CHOICES = 20
+"""Largest number of machines that are offered."""
+_FIRST = ("format.decimal", "raw", "machine")
+"""Keys of the questions on whose answers others depend."""
+
+
+@dataclass
+class MapOfFiles:
+    """How files are read.
+
+    Attributes
+    ----------
+    file : Path or None
+        The map in the run folder; None for files that need none.
+    answers : dict of str to str
+        What was answered.
+    notes : tuple of str
+    """
+
+    file: Path | None = None
+    answers: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: Ask) -> MapOfFiles:
+    """Write the map of files into a run folder. One that a failed run has kept is used again.
+
+    Raises
+    ------
+    DatasetError
+        The files have no table that fits a raw schema, or an answer is missing or wrong.
+    """
+    map_file = folder / MAP
+    if request.map is not None:
+        replace_bytes(map_file, request.map.read_bytes())
+        return MapOfFiles(map_file)
+    if all(is_raw(copy) for copy in copies):
+        return MapOfFiles()
+    if map_file.is_file() and not leaves(folder, map_file) and not request.answers:
+        return MapOfFiles(map_file)
+    schemas: Sequence[RawSchema] = plugins.get("methods", request.method).raw_schemas if request.method else ()
+    stated = {"machine": request.machine, "attributes.axis": request.axis}
+    known = {key: text for key, text in stated.items() if text} | dict(request.answers)
+    found = propose(copies, tuple(schemas), answers=known)
+    if not found.questions and not found.schema:
+        raise DatasetError(f"{found.notes[0]}; describe them by a map: --map FILE", code="add.file.unknown")
+    if not request.answers and (earlier := known_map(copies, _maps(request.runs))) is not None:
+        contradiction = _contradiction(read_toml(earlier), found, known, request.runs, ask)
+        if not contradiction:
+            replace_bytes(map_file, earlier.read_bytes())
+            return MapOfFiles(map_file, notes=(f"read by the map of {earlier.parent.name}",))
+        found = found.answered(contradiction)
+    if request.answers:
+        found = found.answered(request.answers)  # refuses those to questions that there are not
+    answered, notes, found = _asked(found, request.runs, ask)
+    write_map(found, map_file, overwrite=True)
+    return MapOfFiles(map_file, answers=answered | dict(request.answers), notes=notes)
+
+
+def of_machine(question: Question, runs: Path) -> Question:
+    """Return the question for the machine, with those of the record as choices."""
+    known = list_runs([runs]).machines if runs.is_dir() else ()
+    names = dict.fromkeys(filter(None, (question.proposed, *known)))
+    choices = tuple(Choice(name, name) for name in list(names)[:MAX_CHOICES])
+    proposed = question.proposed or (choices[0].value if len(choices) == 1 else "")
+    return Question("machine", "On which machine was this measured?", choices, proposed, needed=True)
+
+
+def _asked(found: Proposal, runs: Path, ask: Ask) -> tuple[dict[str, str], tuple[str, ...], Proposal]:
+    """Return answers, notes and the proposal without questions; what is known of the machine is not asked."""
+    answered: dict[str, str] = {}
+    before, mistake = set[str](), ""
+    while found.questions:
+        machine = str(found.map.get("machine", ""))
+        known = load_machines(runs).answers(machine, found.schema) if machine else {}
+        new = {each.key: known[each.key] for each in found.questions if each.key in known}
+        before |= set(new)
+        if not new:
+            questions = [of_machine(each, runs) if each.key == "machine" else each for each in found.questions]
+            questions.sort(key=lambda each: each.key not in _FIRST)
+            new = dict(ask(questions, mistake))
+        try:
+            found, mistake = found.answered(new), ""
+            answered |= new
+        except DatasetError as error:
+            if error.code != "map.answer":
+                raise
+            mistake = str(error)
+    return answered, (*found.notes, *(f"as before on this machine: {key}" for key in sorted(before))), found
+
+
+def _contradiction(
+    content: Mapping[str, Any], found: Proposal, known: Mapping[str, str], runs: Path, ask: Ask
+) -> dict[str, str]:
+    """Return what holds for the files otherwise than in an earlier map; empty if the map can be used for them.
+
+    The machine, to which values such as a set-up belong, and attributes, such as the axis, may differ between files of
+    one kind: they are asked if the files do not state them, the machine only if the record has several.
+    """
+    questions = {each.key: each for each in found.questions}
+    machine = str(content.get("machine", ""))
+    before = {"machine": machine} if machine else {}
+    for group in ("attributes", "values"):
+        before |= {f"{group}.{name}": text for name, text in content.get(group, {}).items()}
+    for key, text in before.items():
+        question = questions.get(key)
+        now = known.get(key) or (question.proposed if question is not None else "")
+        if not now and question is not None and not key.startswith("values."):
+            asked = replace(question, proposed=str(text))
+            asked = of_machine(asked, runs) if key == "machine" else asked
+            now = str(text) if len(asked.choices) == 1 else dict(ask([asked]))[key]
+        if now and text not in (now, value_of(now)):
+            return {key: now}
+    return {}
+
+
+def _maps(runs: Path) -> Iterator[Path]:
+    """Yield the maps of imported runs, newest first."""
+    if runs.is_dir():
+        folders = (path for path, entry in list_runs([runs]).runs if entry.imported)
+        yield from islice((path / MAP for path in folders if (path / MAP).is_file()), MAX_MAPS)
