@@ -147,7 +147,7 @@ def test_without_a_terminal_missing_answers_are_listed_with_their_options(run: R
     assert list((tmp_path / "runs").iterdir()) == []
     run("add", "a.csv", "--machine", "VMC 850", *FAST)
     (tmp_path / "b.csv").write_text(readings(2, machine=""))
-    assert "Proposed: VMC 850" in run("add", "b.csv", code=1).stderr
+    assert "proposed: VMC 850" in run("add", "b.csv", code=1).stderr
     run("add", "b.csv", "--yes", *FAST)
     assert {each.parent.name[17:18] for each in (tmp_path / "runs").glob("*/run.json")} == {"a", "b"}
 
