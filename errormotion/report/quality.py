@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from errormotion.report.document import Block, Cell, Table, Text
-from errormotion.report.drawings.series import minutes_of
+from errormotion.report.document import Block, Text
 from errormotion.report.fields import remarks
-from errormotion.report.text import DASH, finite, fixed, integer, listed, minutes, percent
+from errormotion.report.text import fixed, integer, listed, minutes, percent
 
 
 def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
@@ -32,47 +30,6 @@ def gaps(valid: np.ndarray, time: np.ndarray) -> tuple[int, float]:
     step = float(np.median(np.diff(time)))
     longest = max(time[stop - 1] - time[start] for start, stop in zip(starts, ends, strict=True))
     return len(starts), float(longest) + step
-
-
-def table(errors: xr.Dataset) -> Table | None:
-    """Return the table of validity and residuals by channel; None if the dataset has neither."""
-    if "valid_fraction" not in errors and "fit_residual" not in errors:
-        return None
-    holder = errors["valid_fraction" if "valid_fraction" in errors else "fit_residual"]
-    time = minutes_of(errors)
-    rows: list[list[Cell | str]] = []
-    for i, name in enumerate(holder["channel"].values):
-        rows.append([str(name), *_validity(errors, i, time), *_residual(errors, i)])
-    return Table(
-        "Validity of the samples and residuals of the fit, by channel. A gap is a sequence of instants without a valid "
-        "sample. Residual: reading minus the reading predicted from the fitted bar.",
-        ["channel", "valid samples", "lowest instant", "gaps", "longest gap", "rms / µm", "largest / µm"],
-        rows,
-        [("", 1), ("validity", 4), ("residual", 2)],
-    )
-
-
-def _validity(errors: xr.Dataset, i: int, time: np.ndarray) -> list[Cell | str]:
-    if "valid_fraction" not in errors:
-        return [Cell(DASH, reason="validity is not part of this result")] * 4
-    fraction = errors["valid_fraction"].transpose("channel", "time").values[i]
-    count, longest = gaps(np.nan_to_num(fraction) > 0, time)
-    lowest = finite(np.min, fraction)
-    return [
-        percent(finite(np.mean, fraction)),
-        percent(lowest),
-        integer(count),
-        minutes(60 * longest) if count else "none",
-    ]
-
-
-def _residual(errors: xr.Dataset, i: int) -> list[Cell | str]:
-    if "fit_residual" not in errors:
-        return [Cell(DASH, reason="residuals are not part of this result")] * 2
-    residual = errors["fit_residual"].transpose("channel", "time").values[i] * 1e6
-    if not np.isfinite(residual).any():
-        return [Cell(DASH, reason="no instant with a residual")] * 2
-    return [fixed(math.sqrt(finite(np.mean, residual**2)), 3), fixed(finite(np.max, np.abs(residual)), 3)]
 
 
 def notes(errors: xr.Dataset) -> list[Block]:

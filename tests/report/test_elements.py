@@ -10,7 +10,7 @@ from errormotion import plugins
 from errormotion.datasets import build_errors
 from errormotion.plugins import FigureOfMerit, Method
 from errormotion.report import write_report
-from errormotion.report.document import Cell, Figure, Source
+from errormotion.report.document import Cell, Figure, Source, Text
 from errormotion.report.elements import (
     Across,
     AgainstLimits,
@@ -29,6 +29,8 @@ from errormotion.report.elements import (
     Sentence,
     Spans,
     Table,
+    Timeline,
+    TimePanel,
 )
 from errormotion.report.exports.tables import sheet
 from errormotion.report.parts import generic
@@ -520,3 +522,59 @@ def test_the_last_row_of_a_table_reduces_all_values():
         ["ball 2", "2.83", "4"],
         ["all", "2.89", ""],
     ]
+
+
+def test_a_column_may_state_a_remark_on_a_known_value_and_the_reasons_of_its_own_selection():
+    ds = xr.Dataset(
+        {
+            "value": (("quantity", "measure"), [[1.0, np.nan], [2.0, 3.0]]),
+            "why": (("quantity", "measure"), [["", "too short"], ["", ""]]),
+            "step": (("quantity", "measure"), [["", ""], ["", "with a step"]]),
+        },
+        {"quantity": ["X", "Y"], "measure": ["range", "slope"]},
+        {"whole": "whole record (9 min)"},
+    )
+    columns = [
+        Column("value", select={"measure": name}, head=f"{name}, {{whole}}", format=".1", reason="why", note="step")
+        for name in ("range", "slope")
+    ]
+    (table,) = Table("Values.", columns, over="quantity", groups=(("", 1), ("{whole}", 2))).blocks(Source(ds), "k")
+    assert [[cell.reason for cell in row[1:]] for row in table.rows] == [["", "too short"], ["", "with a step"]]
+    assert table.head[1:] == ["range, whole record (9 min)", "slope, whole record (9 min)"]
+    assert table.groups == [("", 1), ("whole record (9 min)", 2)]
+
+
+def test_panels_over_time_have_the_limits_and_looks_of_their_quantities():
+    ds = xr.Dataset(
+        {
+            "Z": ("time", 1e-6 * np.arange(4.0), {"units": "m"}),
+            "lost": ("time", np.full(4, np.nan), {"units": "m"}),
+        },
+        {"time": ("time", 60.0 * np.arange(4), {"units": "s"})},
+        {"functional_point": [0.0, 0.0, 0.1]},
+    )
+    panels = (
+        TimePanel("In Z", "Z", looks={"Z": ("#123456", None)}, limits={"Z": "EZ"}),
+        TimePanel("Lost", "lost"),
+        TimePanel("Marked", "lost", empty="no valid value"),
+    )
+    source = Source(ds, limits={"EZ": (-2e-6, 2e-6)})
+    (figure,) = Timeline("At ({point}) mm.", panels, temperatures=False).blocks(source, "k")
+    assert figure.caption == "At (0.0, 0.0, 100.0) mm."
+    assert "#123456" in figure.svg
+    assert "limit of EZ" in figure.svg
+    assert "no valid value" in figure.svg
+    assert "Marked / µm" in figure.svg
+    assert "Lost" not in figure.svg
+    assert Timeline("Nothing.", panels[1:2], temperatures=False, absent="Nothing is known.").blocks(source, "k") == [
+        Text("Nothing is known.", "warning")
+    ]
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_chapter_may_have_a_drawing_beside_its_summary():
+    made = Chapter("Turning", (KeyFigures(),), overview=Curves("All.", ("EX",))).made(Source(over_angles()))
+    assert made.overview.caption.startswith("All.")
+    assert Chapter("Turning", (KeyFigures(),), overview=Curves("None.", ("absent",))).made(
+        Source(over_angles())
+    ).overview is None  # fmt: skip

@@ -53,7 +53,8 @@ class Panel:
     """Curves with one ordinate; named at their ends, or in a legend.
 
     ``strip`` panels are low and filled from 0, for working parameters. ``held``: each value applies since the previous
-    instant, like a mean, not from its own instant on.
+    instant, like a mean, not from its own instant on. ``empty`` stands in a panel without known values;
+    ``zero``: whether a line marks zero.
     """
 
     title: str
@@ -64,6 +65,8 @@ class Panel:
     strip: bool = False
     held: bool = False
     limits: Sequence[tuple[str, float, float]] = ()
+    empty: str = ""
+    zero: bool = True
 
     @property
     def heading(self) -> str:
@@ -246,6 +249,8 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
             single = alone(line.values)
             _dots(axes, time[single], line.values[single], line.colour, 1.8)
     axes.margins(y=0.08)
+    if panel.empty and not any(np.isfinite(line.values).any() for line in panel.lines):
+        axes.text(0.5, 0.5, panel.empty, transform=axes.transAxes, ha="center", va="center", color="#555555")
     if panel.legend:
         low, high = axes.get_ylim()
         if high - low < _MIN_SPAN:
@@ -256,7 +261,8 @@ def _panel(axes: Axes, panel: Panel, time: Array) -> None:
             labelspacing=0.25, handlelength=1.8,
         )  # fmt: skip
     else:
-        axes.axhline(0, color="#888888", linewidth=0.6)
+        if panel.zero:
+            axes.axhline(0, color="#888888", linewidth=0.6)
         canvas.limit_lines(axes, panel.limits)
 
 

@@ -22,7 +22,7 @@ from errormotion.report.elements.standard import (
     Spans,
 )
 from errormotion.report.elements.tables import Column, KeyValue, Table
-from errormotion.report.elements.timelines import LargestAndLast, Timeline
+from errormotion.report.elements.timelines import LargestAndLast, Timeline, TimePanel
 
 __all__ = [
     "PROVENANCE",
@@ -53,5 +53,6 @@ __all__ = [
     "Sentence",
     "Spans",
     "Table",
+    "TimePanel",
     "Timeline",
 ]

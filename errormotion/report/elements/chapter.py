@@ -167,18 +167,23 @@ class Chapter:
         In their order: key figures and values, sentences of the summary, sections, and such parts `On` selections.
     kind : str
         Title line of a report that starts with this chapter.
+    overview : part
+        Its first drawing stands beside the summary.
     """
 
     title: str
     parts: Sequence[Head]
     kind: str = "Test report"
+    overview: Element | None = None
 
     def made(self, source: Source, key: str = "") -> Part:
         """Return the chapter of a dataset; ``key`` distinguishes its drawings, by default the key of the source."""
         made = Part(filled(self.title, source.errors), list[document.KeyFigure](), [], [], kind=self.kind)
         later = list[str]()
         _add(made, later, self.parts, source, key or source.key)
-        return replace(made, summary=[*made.summary, *later])
+        drawn = self.overview.blocks(source, f"{key or source.key}-overview") if self.overview is not None else []
+        overview = next((block for block in drawn if isinstance(block, document.Figure)), None)
+        return replace(made, summary=[*made.summary, *later], overview=overview)
 
 
 def _add(made: Part, later: list[str], parts: Sequence[Any], source: Source, key: str) -> None:

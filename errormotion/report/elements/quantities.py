@@ -120,10 +120,11 @@ class Of:
         si = str(values.attrs.get("units", "1")) if not own else "m" if own in DOF[:3] else "rad"
         shown = names.get(own or name, name.replace("_", " "))
         return Quantity(
-            self._picked(values), None if u is None else self._picked(u), name, shown, *unit_of(si, self.unit)
+            self.picked(values), None if u is None else self.picked(u), name, shown, *unit_of(si, self.unit)
         )
 
-    def _picked(self, values: xr.DataArray) -> xr.DataArray:
+    def picked(self, values: xr.DataArray) -> xr.DataArray:
+        """Return the selected part of values."""
         mine = {dim: label for dim, label in self.select.items() if dim in values.dims}
         return values.sel(mine) if mine else values
 

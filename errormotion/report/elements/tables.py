@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
@@ -45,7 +45,7 @@ class Column(Of):
     Attributes
     ----------
     head : str
-        Its name; by default that of the variable. The unit is added.
+        Its name; by default that of the variable. The unit is added. `{name}` is an attribute of the dataset.
     format : str or callable
         ``.2``: two decimals, ``3``: three significant digits, ``integer``, ``percent``, or a function of the value in
         the unit of the column. By default a value follows its uncertainty, else it has four significant digits.
@@ -55,6 +55,8 @@ class Column(Of):
         Why a value is unknown: the footnote of its dash, or the name of a variable of texts over the rows.
     reduce : str
         How the values at one row become one number: a key of `REDUCTIONS`. The uncertainty is left out.
+    note : str
+        Name of a variable of texts over the rows: the footnote of a known value.
     optional : bool
         Whether the column is left out if the dataset lacks its variable, in place of dashes.
     """
@@ -64,6 +66,7 @@ class Column(Of):
     signed: bool = True
     reason: str = "not determined"
     reduce: str = ""
+    note: str = ""
     optional: bool = False
 
     def title(self, quantity: Quantity | None) -> str:
@@ -148,7 +151,7 @@ class Table:
     where : callable
         Returns which rows are shown, a `DataArray` of bool over the dims of the rows.
     groups : sequence of (str, int)
-        Second head: names over several columns, from the first column.
+        Second head: names over several columns, from the first column; `{name}` is replaced as in the caption.
     notes : sequence of str or callable
         Below the table; a function of the dataset returns several.
     absent : str
@@ -208,11 +211,12 @@ class Table:
         if self.total:
             whole = zip(columns, found, strict=True)
             rows.append([self.total, *(_single(each, q) if q and each.reduce else Cell("") for each, q in whole)])
-        heads = [column.title(each) for column, each in zip(columns, found, strict=True)]
+        heads = [filled(column.title(each), ds) for column, each in zip(columns, found, strict=True)]
         more = [f"{len(indices) - _MOST} more rows are in the dataset."] if len(indices) > _MOST else []
         notes = [note for each in self.notes for note in (each(ds) if callable(each) else [each])]
         head = [self.head or over[-1], *heads]
-        return [document.Table(filled(self.caption, ds), head, rows, self.groups, notes=[*notes, *more])]
+        groups = [(filled(name, ds), span) for name, span in self.groups]
+        return [document.Table(filled(self.caption, ds), head, rows, groups, notes=[*notes, *more])]
 
 
 def _single(column: Column, quantity: Quantity) -> Cell:
@@ -246,7 +250,10 @@ def _column(
             cells[index] = Cell(DASH, reason=MISSING)
         return cells
     values, u = (_over(each, ds, over) for each in (quantity.values, quantity.u))
-    reasons = _over(ds[column.reason], ds, over) if column.reason in ds.variables else None
+    reasons, remarks = (
+        _over(column.picked(ds[name]), ds, over) if name in ds.variables else None
+        for name in (column.reason, column.note)
+    )
     assert values is not None
     spare = [str(dim) for dim in quantity.values.dims if dim not in over and quantity.values.sizes[dim] > 1]
     if spare and not column.reduce:
@@ -264,10 +271,12 @@ def _column(
         if column.reduce:
             known = numbers[np.isfinite(numbers)]
             number = REDUCTIONS[column.reduce](known) if known.size else np.nan
-            cells[index] = column.cell(number, None, why)
+            cell = column.cell(number, None, why)
         else:
             spread = None if u is None else float(u[index].ravel()[0]) / quantity.size
-            cells[index] = column.cell(float(numbers[0]), spread, why)
+            cell = column.cell(float(numbers[0]), spread, why)
+        remark = "" if remarks is None or cell.text == DASH else str(remarks[index].ravel()[0])
+        cells[index] = replace(cell, reason=remark) if remark else cell
     return cells
 
 

@@ -1,58 +1,73 @@
-"""Tables of thermal drift values as in ISO 230-3: ranges and differences, first hour and whole record."""
+"""The thermal drift values of ISO 230-3 in units of the page, with the reasons of missing ones; their two tables."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import xarray as xr
 
-from errormotion.report.document import Cell, Table, estimate
-from errormotion.report.drawings.series import QUANTITIES, Event, curves, end_of_running, minutes_of, unit_of
+from errormotion.report.document import Cell, Source, estimate
+from errormotion.report.drawings.series import QUANTITIES, Event, curves, end_of_running, events, minutes_of, unit_of
+from errormotion.report.elements import Column, Table
+from errormotion.report.provenance import read
 from errormotion.report.text import fixed
 
 _STEP = "includes the step of a compensation that was switched in this interval"
 _SLOPE_INTERVAL = 10.0  # before the end of running, for the end slope, min
-_PER_HOUR = 3600.0
+_SIZES = {"time_constant": 60.0, "end_slope": 1 / 3600.0}
+"""Unit of a measure on the page, s and 1/s; those that are not stated here have none of their own."""
 
 
-def value_of(errors: xr.Dataset, quantity: str, measure: str) -> tuple[float, float]:
-    """Return one ISO 230-3 value and its standard uncertainty in SI; NaN where the dataset does not contain it."""
+def done(errors: xr.Dataset) -> list[Event]:
+    """Return the events of the schedule."""
+    return events(Source(errors, provenance=read(errors)))
+
+
+def values(errors: xr.Dataset) -> xr.Dataset | None:
+    """Return the values over quantity and measure in units of the page; None where the dataset does not contain them.
+
+    ``why`` is the reason of a missing value, ``step`` states that the compensation of a quantity was switched in the
+    interval of a value.
+    """
     if "iso_value" not in errors:
-        return math.nan, math.nan
-    place = {}
-    for dim, label in (("quantity", quantity), ("measure", measure)):
-        places = np.flatnonzero(errors[dim].values == label)
-        if not places.size:
-            return math.nan, math.nan
-        place[dim] = places[0]
-    value, uncertainty = (
-        float(errors.variables[name].isel(place)) if name in errors else math.nan
+        return None
+    dims, switched = ("quantity", "measure"), done(errors)
+    value, u = (
+        errors[name].transpose(*dims).values.copy() if name in errors else np.full(errors["iso_value"].shape, np.nan)
         for name in ("iso_value", "iso_uncertainty")
     )
-    return value, uncertainty
+    labels = [[str(name) for name in errors[dim].values] for dim in dims]
+    why, step = np.full(value.shape, "", dtype=object), np.full(value.shape, "", dtype=object)
+    for k, quantity in enumerate(labels[0]):
+        for m, measure in enumerate(labels[1]):
+            size = _SIZES.get(measure, 1.0) * (1.0 if measure == "time_constant" else unit_of(quantity)[1])
+            value[k, m], u[k, m] = value[k, m] / size, u[k, m] / size
+            why[k, m] = why_not(errors, quantity, measure) if not np.isfinite(value[k, m]) else ""
+            step[k, m] = _STEP if contains_step(errors, quantity, measure, switched) else ""
+    time, stop = minutes_of(errors), end_of_running(errors)
+    units = [unit_of(name)[0] for name in labels[0]]
+    return xr.Dataset(
+        {
+            "value": (dims, value), "u": (dims, u), "why": (dims, why.astype(str)), "step": (dims, step.astype(str)),
+            "unit": ("quantity", units),
+            "per_hour": ("quantity", [f"{unit}/h" for unit in units]),
+            "per_kelvin": ("quantity", [f"{unit}/K" for unit in units]),
+        },
+        dict(zip(dims, labels, strict=True)),
+        {
+            "running": "to the end of running" + (f" ({fixed(time[stop], 1)} min)" if stop is not None else ""),
+            "whole": "whole record" + (f" ({fixed(time[-1], 1)} min)" if time.size else ""),
+        },
+    ).reindex(quantity=list(QUANTITIES), fill_value={"value": np.nan, "u": np.nan, "why": "", "step": "", "unit": "",
+              "per_hour": "", "per_kelvin": ""})  # fmt: skip
 
 
-def cell(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event] = ()) -> Cell:
-    """Return one value in the units of the report with its expanded uncertainty, or a dash with the reason.
-
-    A footnote states that the quantity's compensation was switched in the interval of the value.
-    """
-    value, uncertainty = value_of(errors, quantity, measure)
-    size = 60.0 if measure == "time_constant" else unit_of(quantity)[1]
-    if measure == "end_slope":
-        size /= _PER_HOUR
-    made = estimate(
-        value / size,
-        2 * uncertainty / size,
-        reason="" if math.isfinite(value) else why_not(errors, quantity, measure),
-        signed=not measure.startswith(("range", "time")),
-    )
-    if math.isfinite(value) and contains_step(errors, quantity, measure, done):
-        return replace(made, reason=_STEP)
-    return made
+def cell(found: xr.Dataset, quantity: str, measure: str) -> Cell:
+    """Return a value with its expanded uncertainty."""
+    one = found.sel(quantity=quantity, measure=measure)
+    signed = not measure.startswith(("range", "time"))
+    return estimate(float(one["value"]), 2 * float(one["u"]), signed=signed)
 
 
 def contains_step(errors: xr.Dataset, quantity: str, measure: str, done: Sequence[Event]) -> bool:
@@ -89,37 +104,46 @@ def why_not(errors: xr.Dataset, quantity: str, measure: str) -> str:
     return "too few valid readings in this interval"
 
 
-def tables(errors: xr.Dataset, done: Sequence[Event] = ()) -> list[Table]:
-    """Return the table of drift values and the table of parameters of the curves."""
-    if "iso_value" not in errors:
-        return []
-    time, stop = minutes_of(errors), end_of_running(errors)
-    running = f"to the end of running ({fixed(time[stop], 1)} min)" if stop is not None else "to the end of running"
-    whole = f"whole record ({fixed(time[-1], 1)} min)" if time.size else "whole record"
-    groups = [("", 2), ("first 60 min, d(…)₆₀", 2), (running, 2), (whole, 2)]
-    head = ["quantity", "unit"] + ["range", "difference"] * 3
-    intervals = [f"{kind}_{span}" for span in ("60min", "running", "total") for kind in ("range", "difference")]
-    first = Table(
-        "Thermal drift values. Range: highest minus lowest value in the interval. Difference: value at the end of the "
-        "interval minus value at its start. After ±: expanded uncertainty, k = 2.",
-        head,
-        [[f"d({name})", unit_of(name)[0], *(cell(errors, name, m, done) for m in intervals)] for name in QUANTITIES],
-        groups,
+def _column(measure: str, head: str = "") -> Column:
+    return Column(
+        "value",
+        uncertainty="u",
+        select={"measure": measure},
+        head=head or measure.partition("_")[0],
+        signed=not measure.startswith(("range", "time")),
+        reason="why",
+        note="step",
     )
-    second = Table(
-        "Course of the drift. Time constant of the first approach, slope at the end of running, and displacement or "
-        "tilt per kelvin of temperature change. After ±: expanded uncertainty, k = 2.",
-        ["quantity", "time constant / min", "end slope", "unit", "per kelvin", "unit"],
-        [
-            [
-                f"d({name})",
-                cell(errors, name, "time_constant", done),
-                cell(errors, name, "end_slope", done),
-                f"{unit_of(name)[0]}/h",
-                cell(errors, name, "per_kelvin", done),
-                f"{unit_of(name)[0]}/K",
-            ]
-            for name in QUANTITIES
-        ],
-    )
-    return [first, second]
+
+
+def _quantity(found: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:  # noqa: ARG001 - one dim
+    return f"d({found['quantity'].values[index[0]]})"
+
+
+DRIFT = Table(
+    "Thermal drift values. Range: highest minus lowest value in the interval. Difference: value at the end of the "
+    "interval minus value at its start. After ±: expanded uncertainty, k = 2.",
+    (
+        Column("unit"),
+        *(_column(f"{kind}_{span}") for span in ("60min", "running", "total") for kind in ("range", "difference")),
+    ),
+    over="quantity",
+    of=values,
+    place=_quantity,
+    groups=(("", 2), ("first 60 min, d(…)₆₀", 2), ("{running}", 2), ("{whole}", 2)),
+    absent="The result contains no ISO 230-3 values.",
+)
+COURSE = Table(
+    "Course of the drift. Time constant of the first approach, slope at the end of running, and displacement or "
+    "tilt per kelvin of temperature change. After ±: expanded uncertainty, k = 2.",
+    (
+        _column("time_constant", "time constant / min"),
+        _column("end_slope", "end slope"),
+        Column("per_hour", head="unit"),
+        _column("per_kelvin", "per kelvin"),
+        Column("per_kelvin", head="unit"),
+    ),
+    over="quantity",
+    of=values,
+    place=_quantity,
+)

@@ -11,8 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
 from errormotion.report import canvas
-from errormotion.report.document import Cell, Figure, Table
+from errormotion.report.document import Block, Figure, Source
 from errormotion.report.drawings.series import LOOK, curves, end_of_running, last_known
+from errormotion.report.elements import Column, Table
 from errormotion.report.text import fixed, integer, listed
 
 _NEEDED = ("beam_origin", "beam_direction", "bar_axis_point", "bar_axis_direction", "bar_radius")
@@ -94,11 +95,12 @@ def _levels(errors: xr.Dataset) -> np.ndarray:
     return np.array([])
 
 
-def figure(errors: xr.Dataset, key: str) -> Figure | None:
-    """Return the drawing in three views, to scale, with the drift enlarged; None where the geometry is not known."""
+def drawing(source: Source, key: str) -> list[Block]:
+    """Return the drawing in three views, to scale, with the drift enlarged; nothing if the geometry is not known."""
+    errors = source.errors
     setup = setup_of(errors)
     if setup is None:
-        return None
+        return []
     moved = _moved(errors, setup)
     factor = _exaggeration(moved)
     side = [i for i in range(3) if i != setup.along]
@@ -132,34 +134,36 @@ def figure(errors: xr.Dataset, key: str) -> Figure | None:
         f"Views {listed(['XYZ'[a] + 'XYZ'[b] for a, b in views])} of a bar with the beams {listed(setup.names)}; "
         f"levels at {listed([f'{fixed(1e3 * z, 1)} mm' for z in setup.levels]) or 'unknown heights'}."
     )
-    return Figure(svg, caption, alt)
+    return [Figure(svg, caption, alt)]
 
 
-def table(errors: xr.Dataset) -> Table | None:
-    """Return origin, direction, offset from the bar's axis and first reading of every beam."""
+def _beams(errors: xr.Dataset) -> xr.Dataset | None:
+    """Return the beams with their offset and first reading; None if the geometry is not known."""
     setup = setup_of(errors)
     if setup is None:
         return None
-    rows: list[list[Cell | str]] = []
-    for i, name in enumerate(setup.names):
-        reading = 1e3 * setup.reading[i]
-        rows.append(
-            [
-                name,
-                *(fixed(1e3 * value, 3) for value in setup.origin[i]),
-                *(fixed(value, 5) for value in setup.direction[i]),
-                fixed(1e6 * setup.offset[i], 0),
-                fixed(reading, 3) if math.isfinite(reading) else Cell("—", reason="no valid reading"),
-            ]
-        )
-    return Table(
-        "Beams as used for the evaluation. Origin: start of the measuring range. Offset: distance between the beam "
-        "and the axis of the bar (for a beam along the bar, of its spot from the axis). Reading: at the first valid "
-        "instant.",
-        ["beam", "x / mm", "y / mm", "z / mm", "u_x", "u_y", "u_z", "offset / µm", "reading / mm"],
-        rows,
-        [("", 1), ("origin", 3), ("direction", 3), ("on the bar", 2)],
-    )
+    own = {"offset": ("channel", setup.offset, {"units": "m"}), "reading": ("channel", setup.reading, {"units": "m"})}
+    return errors.assign(own)
+
+
+BEAMS = Table(
+    "Beams as used for the evaluation. Origin: start of the measuring range. Offset: distance between the beam and the "
+    "axis of the bar (for a beam along the bar, of its spot from the axis). Reading: at the first valid instant.",
+    (
+        *(
+            Column(name, "none", unit, {"direction": axis}, head=head + axis, format=places, signed=False)
+            for name, unit, head, places in (("beam_origin", "mm", "", ".3"), ("beam_direction", "", "u_", ".5"))
+            for axis in "xyz"
+        ),
+        Column("offset", unit="um", format=".0", signed=False),
+        Column("reading", unit="mm", format=".3", signed=False, reason="no valid reading"),
+    ),
+    over="channel",
+    head="beam",
+    of=_beams,
+    groups=(("", 1), ("origin", 3), ("direction", 3), ("on the bar", 2)),
+    absent="The result does not contain the geometry of beams and bar.",
+)
 
 
 def _limits(setup: Setup, i: int) -> tuple[float, float]:
