@@ -20,9 +20,10 @@ from errormotion.campaign.files import load_bench
 from errormotion.dashboard.access import LOOPBACK, Access, access_for
 from errormotion.dashboard.door import Door, Server, listeners
 from errormotion.dashboard.lab import Lab
-from errormotion.dashboard.pages import compare, compensate, measure, now, results
+from errormotion.dashboard.pages import adding, compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
 from errormotion.dashboard.pages.page import Context, Guarded, note_request
+from errormotion.dashboard.uploads import MAX_UPLOAD
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import RunError
 
@@ -131,6 +132,7 @@ def application(context: Context) -> Application:
             *((path, handler, one) for path, handler in measure.HANDLERS),
             *compensate.handlers(context),
             (r"/results", results.Results, one),
+            *((path, handler, one) for path, handler in adding.HANDLERS),
             (r"/run", results.Run, one),
             (r"/run/figure\.json", results.Figure, one),
             (r"/run/values\.csv", results.Values, one),
@@ -154,7 +156,8 @@ def door_of(context: Context, served: Application) -> Door:
         session = _cookie(headers.get("Cookie", ""), context.cookie)
         return context.access.refusal(method, headers, session, public=path == LOGIN, controls=False)
 
-    return Door(served, refusal, lambda path: MAX_LOGIN if path == LOGIN else MAX_REQUEST)
+    longest = {LOGIN: MAX_LOGIN, adding.UPLOAD: MAX_UPLOAD}
+    return Door(served, refusal, lambda path: longest.get(path, MAX_REQUEST))
 
 
 def _cookie(text: str, name: str) -> str | None:

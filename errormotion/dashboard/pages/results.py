@@ -59,6 +59,7 @@ class Results(Guarded):
             number=first // PAGE + 1,
             links=links,
             runs=self.context.lab.runs,
+            control=self.context.control,
         )
 
 

@@ -14,12 +14,12 @@ function element(name, text, className) {
 
 // Send a request to the server; with a body by POST. A status of 403 leads to the login, since the dashboard may have been
 // restarted with another token; not with stay, if the page contains input of the user.
-async function answerOf(path, { body, limit = 10000, stay = false } = {}) { // body: a value for JSON, or a form
+async function answerOf(path, { body, limit = 10000, stay = false } = {}) { // body: a value for JSON, a form, or a file
   const options = { headers: { Accept: "application/json" }, signal: limit ? AbortSignal.timeout(limit) : undefined };
   if (body !== undefined) {
-    const isForm = body instanceof URLSearchParams;
-    Object.assign(options, { method: "POST", body: isForm ? body : JSON.stringify(body) });
-    if (!isForm) options.headers["Content-Type"] = "application/json";
+    const asIs = body instanceof URLSearchParams || body instanceof Blob;
+    Object.assign(options, { method: "POST", body: asIs ? body : JSON.stringify(body) });
+    if (!asIs) options.headers["Content-Type"] = "application/json";
     options.headers["X-Errormotion-Control"] = localStorage.getItem(CONTROL) ?? "";
   }
   let answer;

@@ -63,8 +63,8 @@ def _asked(questions: Sequence[Question], mistake: str = "") -> Mapping[str, str
     values = [choice.value for choice in question.choices]
     show(f"\n{question.text}", err=True)
     for number, choice in enumerate(question.choices, 1):
-        meaning = "" if choice.text == choice.value else f": {choice.text}"
-        show(f"  {number}  {choice.value}{meaning}", err=True)
+        text = choice.text if choice.text.startswith(choice.value) else f"{choice.value}: {choice.text}"
+        show(f"  {number}  {text}", err=True)
     default = str(values.index(question.proposed) + 1) if question.proposed in values else question.proposed
     prompt = "Number" if values else "Answer"
     prompt += "" if question.needed else " (may be left empty)"

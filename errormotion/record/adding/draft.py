@@ -1,0 +1,76 @@
+"""Files that a person is about to add: their tables, the proposed meaning of the columns, and the questions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from errormotion import plugins
+from errormotion.datasets.maps.proposal import Preview, Question, propose
+from errormotion.errors import DatasetError
+from errormotion.record.adding.machines import load_machines
+from errormotion.record.adding.mapping import of_machine
+from errormotion.record.adding.reading import is_raw, owner_of, read_raw
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What is known of files before they are added.
+
+    Attributes
+    ----------
+    kind : str
+        What the data are for.
+    tables : tuple of Preview
+        Empty for files that need no map.
+    questions : tuple of Question
+        All that the answers leave open; ``proposed`` is also what is known of the machine.
+    notes : tuple of str
+    """
+
+    kind: str
+    tables: tuple[Preview, ...]
+    questions: tuple[Question, ...]
+    notes: tuple[str, ...]
+
+    def plain(self) -> dict[str, Any]:
+        """Return the draft for a JSON document."""
+        tables = [{**asdict(each), "path": each.path.name, "format": dict(each.format)} for each in self.tables]
+        return {
+            "kind": self.kind,
+            "tables": tables,
+            "questions": [asdict(each) for each in self.questions],
+            "notes": list(self.notes),
+        }
+
+
+def draft_of(paths: Sequence[Path], runs: Path, answers: Mapping[str, str]) -> Draft:
+    """Return the draft of files with the answers so far.
+
+    Raises
+    ------
+    DatasetError
+        A file cannot be read, or an answer is wrong (``map.answer``).
+    """
+    if all(is_raw(path) for path in paths):
+        with read_raw(paths, None) as raw:
+            owner, machine = owner_of(raw), str(raw.attrs.get("machine", "")).replace("unknown", "")
+        questions = () if machine or "machine" in answers else (Question("machine", "", (), "", needed=True),)
+        return Draft(owner.info.summary, (), tuple(of_machine(each, runs) for each in questions), ())
+    found = propose(paths)
+    if not found.questions and not found.schema:
+        raise DatasetError(found.notes[0], code="add.file.unknown")
+    for key in sorted(answers, key=lambda each: each not in ("format.decimal", "raw")):
+        found = found.answered({key: answers[key]})
+    machine = str(found.map.get("machine", ""))
+    known = load_machines(runs).answers(machine, found.schema)
+    questions = tuple(
+        of_machine(each, runs)
+        if each.key == "machine"
+        else Question(each.key, each.text, each.choices, known.get(each.key, each.proposed), each.needed)
+        for each in found.questions
+    )
+    owner = plugins.owner_of_schema(found.schema) if found.schema else None
+    return Draft(owner.info.summary if owner is not None else "", found.tables, questions, found.notes)
