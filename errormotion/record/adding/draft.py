@@ -57,8 +57,8 @@ def draft_of(paths: Sequence[Path], runs: Path, answers: Mapping[str, str]) -> D
     if all(is_raw(path) for path in paths):
         with read_raw(paths, None) as raw:
             owner, machine = owner_of(raw), str(raw.attrs.get("machine", "")).replace("unknown", "")
-        questions = () if machine or "machine" in answers else (Question("machine", "", (), "", needed=True),)
-        return Draft(owner.info.summary, (), tuple(of_machine(each, runs) for each in questions), ())
+        asked = [] if machine or "machine" in answers else [of_machine(Question("machine", "", (), "", True), runs)]
+        return Draft(owner.info.summary, (), tuple(asked), ())
     found = propose(paths)
     if not found.questions and not found.schema:
         raise DatasetError(found.notes[0], code="add.file.unknown")
