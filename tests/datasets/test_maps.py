@@ -28,6 +28,7 @@ LOG = """t [s],a [um],b [um],c [um],d [um],e [um]
 """
 POSITIONING = 'schema = "errormotion.map/2"\nraw = "errormotion.raw.linear_positioning/1"\nattributes = {axis = "X"}\n'
 MONITOR = 'schema = "errormotion.map/2"\nraw = "errormotion.raw.monitor/1"\n'
+PLACES = "[columns]\nposition = ['a', 'b', 'c']\ntime = 't'\n"
 TRACKER = (
     'schema = "errormotion.map/2"\nraw = "errormotion.raw.multilateration/1"\nvalues.displacement_noise = "1 um"\n'
 )
@@ -90,6 +91,13 @@ def test_a_deviation_is_the_difference_of_two_columns(imported) -> None:
     np.testing.assert_allclose(raw["deviation"].squeeze(), [0.5e-6, 1.5e-6, 2.5e-6], rtol=1e-6)
 
 
+def test_columns_of_different_units_are_not_subtracted(imported) -> None:
+    text = POSITIONING + 'sequence = "Soll"\n[columns]\ntarget_position = "Soll"\n'
+    text += 'deviation.EXX = {column = "Ist", minus = "Soll"}\n'
+    with pytest.raises(DatasetError, match=r"columns.deviation.EXX.minus: expected a column in um; found mm"):
+        imported(text, log="Soll [mm];Ist [um]\n0;0,5\n100;100001,5\n200;200002,5\n")
+
+
 def test_a_matrix_has_one_line(imported) -> None:
     text = POSITIONING + 'labels = {target = "Target"}\n[columns]\ntarget_position = "Target"\n'
     text += 'deviation.EXX = {columns = ["1+", "1-"], unit = "um", labels = {run = [1, 1], '
@@ -142,6 +150,8 @@ WRONG = [
     ("an unknown variable", DRIFT.replace("distance =", "distanc ="), LOG, "columns.distanc.*: unknown variable"),
     ("a unit of no column", with_("[units]\nlength = 'mm'\n"), LOG, "'length' has no column"),
     ("too few columns", DRIFT.replace('"d", "e"', '"d"'), LOG, r"expected 5 columns \(X1 X2 Y1 Y2 Z\); found 4"),
+    ("another order", DRIFT.replace('"a", "b"', '"X2", "X1"'), LOG, "in the order X1 X2 Y1 Y2 Z; found 'X2' for X1"),
+    ("a unit of two meanings", MONITOR + PLACES, LOG.replace("a [um]", "a [grad]"), "found 'grad'"),
     ("no unit", DRIFT, LOG.replace("a [um]", "a"), "units.distance.X1: log.csv states no unit for column 'a'"),
     ("another unit", DRIFT, LOG.replace("a [um]", "a [V]"), "expected a unit of the kind of m; found 'V'"),
     ("no such column", DRIFT, LOG.replace("a [um]", "f [um]"), "columns.distance.X1: no column 'a'"),

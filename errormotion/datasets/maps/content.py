@@ -12,6 +12,7 @@ from errormotion.datasets.maps.fit import Assigned, Fit
 from errormotion.datasets.maps.form import MAP_SCHEMA
 from errormotion.datasets.maps.questions import Question, place_of
 from errormotion.datasets.schemas import variants
+from errormotion.datasets.tables.table import same
 from errormotion.datasets.text.table_reader import FREEDOM
 
 
@@ -95,6 +96,9 @@ def _part(part: Fit, given: Mapping[str, str]) -> dict[str, Any]:
     units = {}
     for name, group in groups.items():
         stated = given.get(f"units.{name}", "")
+        if group[0].minus is not None and not stated:  # the unit of the column that is subtracted
+            other = next((each.name for each in part.columns if each.column.index == group[0].minus.index), "")
+            stated = given.get(f"units.{other}", "")
         if stated and (len(group[0].column.dates) > 1 or not group[0].column.unit_for(rows[name])):
             units[name] = stated
     if units:
@@ -120,10 +124,13 @@ def _entry(name: str, group: Sequence[Assigned], part: Fit, given: Mapping[str, 
     if not label:
         return _single(group[0])
     components = {label if each.key.endswith("?") else each.key.partition(".")[2]: _single(each) for each in group}
-    if components == {key: key for key in components}:
+    # A list has the order of the labels that the schema states, or its names are the labels.
+    row = next(row for row in part.raw.rows if row.name == name)
+    fixed = next((part.raw.labels[dim] for dim in reversed(row.dims) if dim in part.raw.labels), None)
+    if fixed is None and components == {key: key for key in components}:
         return list(components)
-    if list(components) == ["x", "y", "z"] and all(isinstance(each, str) for each in components.values()):
-        return list(components.values())
+    if fixed == ("x", "y", "z") and set(components) == set(fixed):
+        return [components[label] for label in fixed]
     return components
 
 
@@ -140,7 +147,7 @@ def _place(column: Content) -> str | int:
 def _place_of(column: Content, index: int) -> str | int:
     own = Content(column.table, (index,), column.kind)
     text = place_of(own)
-    return text if text == own.title and column.table.form.header is not False else int(text)
+    return text if text == same(own.title) and column.table.form.header is not False else int(text)
 
 
 def _pattern(name: str, others: Sequence[str]) -> str:

@@ -166,6 +166,10 @@ def _entries(
             return
         if labels and len(labels) != len(entry):
             raise ValueError(f"columns.{name}: expected {len(labels)} columns ({' '.join(labels)}); found {len(entry)}")
+        others = [f"'{at}' for {own}" for own, at in zip(labels, entry, strict=False) if at in labels and at != own]
+        if others:
+            order = " ".join(labels)
+            raise ValueError(f"columns.{name}: expected columns in the order {order}; found {', '.join(others)}")
         yield from _components(name, dict(zip(labels or map(str, entry), entry, strict=True)), row, dim, schemas)
     elif _is_place(entry):
         yield name, {"column": entry}

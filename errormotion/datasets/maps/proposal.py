@@ -14,7 +14,7 @@ from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.maps.columns import Content, contents
 from errormotion.datasets.maps.content import map_of
 from errormotion.datasets.maps.fit import Fit, fit, further
-from errormotion.datasets.maps.questions import Choice, Question, questions_of
+from errormotion.datasets.maps.questions import Choice, Question, is_column, questions_of
 from errormotion.datasets.maps.reading import kind_of
 from errormotion.datasets.schemas import RawSchema, raw_schemas
 from errormotion.datasets.tables.format import Format
@@ -263,7 +263,7 @@ def _corrected(found: Fit, columns: Sequence[Content], answers: Mapping[str, str
         own = next((each for each in found.columns if each.key == where), None)
         if not key.startswith("columns.") or own is None:
             continue
-        column = next((each for each in columns if text in (each.title, str(each.index + 1))), None)
+        column = next((each for each in columns if is_column(text, each)), None)
         if column is None:
             continue
         other = next((each for each in found.columns if each.column.index == column.index), None)

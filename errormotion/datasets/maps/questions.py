@@ -16,6 +16,7 @@ from errormotion.datasets.maps.words import likeness, tokens
 from errormotion.datasets.schemas import POSITION, RawSchema, Row
 from errormotion.datasets.tables.dates import COUNTED, EXCEL, UNIX, UNIX_MS
 from errormotion.datasets.tables.mistakes import Mistakes
+from errormotion.datasets.tables.table import name_of, same
 from errormotion.datasets.text.log_import import read_value
 from errormotion.datasets.text.log_map import MappedValue
 from errormotion.datasets.text.table_reader import Found, Names
@@ -124,10 +125,17 @@ def _columns(main: Fit) -> list[Question]:
 
 def place_of(column: Content) -> str:
     """Return the name of a column, or its number where that is not unique."""
-    titles = column.table.titles
-    if column.table.form.header is False or titles.count(column.title) != 1 or not column.title:
-        return str(column.index + 1)
-    return column.title
+    titles = [same(title) for title in column.table.titles]
+    title = same(column.title)
+    return (
+        str(column.index + 1) if column.table.form.header is False or titles.count(title) != 1 or not title else title
+    )
+
+
+def is_column(answer: str, column: Content) -> bool:
+    """Return whether an answer is the name of a column, with or without its unit, or its number."""
+    title = same(column.title)
+    return same(answer) in (title, name_of(title), str(column.index + 1))
 
 
 def _shown(column: Content) -> str:
@@ -186,7 +194,7 @@ def _units(part: Fit, answers: Mapping[str, str]) -> list[Question]:
     for each in part.columns:
         row = next(row for row in part.raw.rows if row.name == each.name)
         key = f"units.{each.name}"
-        if key in found or each.column.table.units is None:
+        if key in found or each.minus is not None:  # a difference has the unit of both columns
             continue
         title = f"column '{each.column.title}'"
         if each.column.kind == DATES:
@@ -328,12 +336,13 @@ def _check(question: Question, answer: str, main: Fit) -> None:
             raise DatasetError(f"{question.key}: {mistakes.first.removeprefix(f'values.{name}: ')}", code="map.answer")
         return
     values = [choice.value for choice in question.choices]
+    known = not values or answer in values
     if question.key.startswith("units."):
-        usual = [*values]
         row = next(row for row in raw.rows if row.name == question.key.partition(".")[2].partition(".")[0])
-        if answer in usual or fitting_unit(answer, row):
-            return
-    elif not values or answer in values:
+        known |= bool(fitting_unit(answer, row))
+    elif question.key.startswith("columns."):
+        known |= any(is_column(answer, each.column) for each in main.columns)
+    if known:
         return
     raise DatasetError(
         f"{question.key}: expected {'one of ' + ', '.join(values) if values else 'an answer'}; found '{answer}'",

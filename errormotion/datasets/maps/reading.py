@@ -45,6 +45,9 @@ def dataset_of(settings: MapFile, tables: Sequence[Table], map_file: Path) -> xr
     """Return the raw dataset of the tables of a map, one for each of its parts."""
     mistakes = Mistakes(map_file)
     maps = [_log_map(settings, part, table, mistakes) for part, table in zip(settings.parts, tables, strict=True)]
+    for part, table in zip(settings.parts, tables, strict=True):
+        for key, entry in part.columns.items():
+            _check_difference(key, entry, table, mistakes)
     mistakes.raise_any()
     names = names_of(maps, mistakes)
     columns = [checked_columns(each, names, mistakes) for each in maps]
@@ -184,8 +187,18 @@ def _unit(
             f"the kind of {goals}; found {repr(unit) if unit else 'none'}",
         )
         return row.unit
-    fitting = fitting_unit(unit, row, freedom)
-    return fitting or unit
+    return fitting_unit(unit, row, freedom) or unit
+
+
+def _check_difference(key: str, entry: MappedColumn, table: Table, mistakes: Mistakes) -> None:
+    """Add a mistake if a column and the one that is subtracted have different units in the file."""
+    if entry.minus is None or isinstance(entry.column, list):
+        return
+    before = mistakes.count
+    places = [table.place(each, f"columns.{key}", mistakes) for each in (entry.column, entry.minus)]
+    own, other = (table.units[place] if place < len(table.units) else "" for place in places)
+    if mistakes.count == before and own != other:
+        mistakes.add(0, f"columns.{key}.minus: expected a column in {own or 'no unit'}; found {other or 'no unit'}")
 
 
 def date_units(table: Table, columns: Sequence[int]) -> list[str]:

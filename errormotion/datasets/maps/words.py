@@ -49,6 +49,8 @@ SYNONYMS = {
 }
 """Words of titles by a word of the names of variables and dimensions."""
 
+_NAMED = {"spindle_speed": frozenset(["drehzahl", "spindeldrehzahl", "rpm", "upm", "n"])}
+"""Words that state a variable of several words on their own."""
 _FORWARD = """
 forward forwards fwd + vor vorwärts hin up pos positiv positive increasing v f auf plus
 """
@@ -84,7 +86,7 @@ def likeness(title: str, name: str, further: Iterable[str] = ()) -> float:
     if plain == name.lower() or plain in {"_".join(_TOKEN.findall(each.lower())) for each in stated}:
         return 3.0
     letters = [token for token in own if not token.isdigit()]
-    single = frozenset(each for each in stated if len(_TOKEN.findall(each)) == 1)
+    single = _NAMED.get(name, frozenset()) | frozenset(each for each in stated if len(_TOKEN.findall(each)) == 1)
     # every part of the name counts: an air temperature is no spindle temperature
     parts = [SYNONYMS.get(part, frozenset([part])) for part in name.lower().split("_")]
     hits = sum(any(_says(token, words) for token in letters) for words in parts)
