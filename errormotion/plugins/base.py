@@ -136,8 +136,8 @@ class Method(Owner):
         """Return mistakes that can be found before a measurement, by setting; called when a campaign is read."""
         return _NONE
 
-    def machine_defaults(self, machine: MachineDescription) -> Mapping[str, Any]:  # noqa: ARG002
-        """Return defaults of settings that follow from the machine of the bench."""
+    def machine_defaults(self, machine: MachineDescription, settings: Any) -> Mapping[str, Any]:  # noqa: ARG002
+        """Return defaults of settings that follow from the machine of the bench; ``settings`` are those stated."""
         return _NONE
 
     def check_machine(self, settings: Any, machine: MachineDescription) -> Mapping[str, str]:  # noqa: ARG002

@@ -119,7 +119,7 @@ def test_limits_outside_the_travel_are_an_error(tmp_path: Path) -> None:
 
 
 def test_settings_that_are_not_stated_follow_from_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def machine_defaults(_self: object, machine: MachineDescription) -> dict[str, float]:
+    def machine_defaults(_self: object, machine: MachineDescription, _settings: object) -> dict[str, float]:
         return {"level": machine.travel["Z"][1], "count": 7}
 
     monkeypatch.setattr(plugins.get("methods", "ramp"), "machine_defaults", machine_defaults, raising=False)

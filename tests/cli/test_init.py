@@ -4,12 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from coded import raises
 from command_line import Result
 
+from errormotion import plugins
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.cli.commands.campaigns.init import command
 from errormotion.datasets.files.tomlfile import parse_toml
 from errormotion.datasets.files.tomltext import key, value
+from errormotion.methods.linear_positioning.planning.targets import reach
 
 Run = Callable[..., Result]
 CHAIN = "workpiece-X-Y-bed-Z-spindle-tool"
@@ -50,10 +53,43 @@ def test_mistakes_are_those_of_the_files_and_nothing_is_written(run: Run, tmp_pa
     assert not (tmp_path / "new").exists()
 
 
+def test_a_test_is_that_of_the_machine_of_any_travel(run: Run, tmp_path: Path) -> None:
+    controller = (
+        "--instrument",
+        "control=virtual_controller@sim://cframe",
+        "--instrument",
+        "laser=attocube_ids@sim://cframe",
+    )
+    for low, high in ((-300, 300), (0, 500), (100, 1900)):
+        travel = ("--chain", "workpiece-X-bed-spindle-tool", "--travel", f"X={low} mm,{high} mm")
+        said = run("init", f"at{low}", "--machine", "M", *travel, *controller, "--test", "a=linear_positioning").stdout
+        assert "Test a: from the machine travel" in said
+        settings = load_campaign(tmp_path / f"at{low}" / "campaign.toml").tests[0].settings
+        span = low * 1e-3, high * 1e-3
+        assert span[0] <= reach(settings)[0]
+        assert reach(settings)[1] <= span[1]
+        assert settings.travel == pytest.approx(span, abs=0.01)
+
+
+def test_answers_with_a_mistake_are_written_and_named(tmp_path: Path) -> None:
+    given = iter([CHAIN, "-300 mm, 300 mm", "-200 mm, 200 mm", "0 mm, 400 mm", "a", "duration"])
+    with raises("toml.mistakes") as caught:
+        command.init(
+            tmp_path, "M", "", [], ["frame=five_sensor_frame@sim://cframe"], ["a=spindle_drift"],
+            ["a.duration=2 mins."], force=False, as_json=False, ask=lambda question, default: next(given),
+        )  # fmt: skip
+    assert "test[0].settings.duration: expected a time" in str(caught.value)
+    assert "were written nevertheless" in str(caught.value)
+    assert load_bench(tmp_path / "bench.toml").machine == "M"
+    assert "2 mins." in (tmp_path / "campaign.toml").read_text()
+
+
 def test_interactive_questions_write_the_same_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drivers = [(cls.info.id, cls.info.kind) for cls in plugins.loaded("instruments")]
+    number = 1 + [each for each, _ in sorted(drivers, key=lambda one: (one[1], one[0]))].index("five_sensor_frame")
     given = iter([
         "VM 1", "X-X", CHAIN, "300 mm, -300 mm", "-300 mm, 300 mm", "-200 mm, 200 mm", "0 mm, 400 mm",
-        "five_sensor_frme", "five_sensor_frame", "no name", "frame", "sim://cframe?seed=3", "",
+        "five_sensor_frme", str(number), "no name", "frame", "sim://cframe?seed=3", "",
         "normal_vector", "spindle_drift", "", "",
     ])  # fmt: skip
     command.init(

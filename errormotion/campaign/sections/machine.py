@@ -86,7 +86,7 @@ def completed(method: Any, settings: Any, machine: MachineDescription | None) ->
     """Return the settings of a method; those that are not stated get the defaults of the machine."""
     if machine is None:
         return settings
-    defaults = method().machine_defaults(machine)
+    defaults = method().machine_defaults(machine, settings)
     given = {key: value for key, value in defaults.items() if key not in settings.model_fields_set}
     return settings.model_copy(update=given)
 

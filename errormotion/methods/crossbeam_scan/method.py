@@ -84,7 +84,11 @@ class CrossbeamScan(ModelMethod):
             return pocket.record_pocket(bench, settings, done)
         return acquisition.record_scans(bench, settings, inputs.get("pose"), done)
 
-    def machine_defaults(self, machine: MachineDescription) -> dict[str, Any]:
+    def machine_defaults(
+        self,
+        machine: MachineDescription,
+        settings: CrossbeamScanSettings,  # noqa: ARG002 - part of the protocol
+    ) -> dict[str, Any]:
         """Return the travel of Y."""
         return {"travel": machine.travel["Y"]} if "Y" in machine.travel else {}
 

@@ -117,6 +117,16 @@ class LinearPositioning(ModelMethod):
 
         return lacking(settings)
 
+    def machine_defaults(self, machine: MachineDescription, settings: LinearPositioningSettings) -> dict[str, Any]:
+        """Return the whole travel of the axis, less the overrun and what random positions of targets go beyond."""
+        from errormotion.methods.linear_positioning.planning.targets import within
+
+        span = machine.travel.get(settings.axis)
+        if span is None or settings.diagonals is not None or settings.targets:
+            return {}
+        travel = span if settings.moving is not None else within(settings, span)
+        return {} if travel is None else {"travel": travel}
+
     def check_machine(self, settings: LinearPositioningSettings, machine: MachineDescription) -> dict[str, str]:
         """Return by setting what the machine cannot do: an axis that it does not have, targets outside its travel."""
         from errormotion.methods.linear_positioning.diagonals import planning

@@ -136,7 +136,10 @@ class LinearPositioningSettings(PluginSettings):
     freedoms: tuple[Freedom, ...] = Field(
         default=("EX",), min_length=1, description="freedoms that are measured, such as EX for positioning along X"
     )
-    travel: tuple[Length, Length] = Field(default=(0.0, 0.5), description="first and last position of the targets")
+    travel: tuple[Length, Length] = Field(
+        default=(0.0, 0.5),
+        description="first and last position of the targets; default: the travel of the machine, if it is known",
+    )
     limits: tuple[Length, Length] | None = Field(
         default=None, description="lowest and highest position of the axis, overrun included; default none"
     )

@@ -73,7 +73,11 @@ class Multilateration(ModelMethod):
 
         return steps(settings)
 
-    def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
+    def machine_defaults(
+        self,
+        machine: MachineDescription,
+        settings: MultilaterationSettings,  # noqa: ARG002 - part of the protocol
+    ) -> dict[str, str]:
         """Return the chain of the moving axes."""
         return {"chain": machine.moving_chain}
 

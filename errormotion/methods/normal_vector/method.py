@@ -107,7 +107,11 @@ class NormalVector(ModelMethod):
             )
         return mistakes
 
-    def machine_defaults(self, machine: MachineDescription) -> dict[str, str]:
+    def machine_defaults(
+        self,
+        machine: MachineDescription,
+        settings: NormalVectorSettings,  # noqa: ARG002 - part of the protocol
+    ) -> dict[str, str]:
         """Return the axes that carry the tool."""
         return {"tool_axes": machine.tool_axes}
 

@@ -19,6 +19,8 @@ LONG_TRAVEL = 2.0
 PER_METRE, LONG_INTERVAL, FEWEST = 5.0, 0.25, 11
 RANDOM_SHARE = 0.3
 """Largest random part of a position as a share of the interval."""
+_STEPS, _DISPLAY = 10, 1e-3
+"""Attempts to fit targets into a travel, and steps of its ends, m."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,21 @@ def reach(settings: LinearPositioningSettings) -> tuple[float, float]:
     """Return the lowest and highest position of the axis, overrun included, m."""
     P = positions(settings)
     return float(P[0]) - settings.overrun, float(P[-1]) + settings.overrun
+
+
+def within(settings: LinearPositioningSettings, span: tuple[float, float]) -> tuple[float, float] | None:
+    """Return the longest travel of the targets with which the axis stays in its span, m; None if there is none."""
+    low, high = span
+    for _ in range(_STEPS):
+        if not low < high:
+            return None
+        first, last = reach(settings.model_copy(update={"travel": (low, high)}))
+        beyond = max(span[0] - first, 0.0), max(last - span[1], 0.0)
+        if not any(beyond):
+            return low, high
+        low = _DISPLAY * math.ceil((low + beyond[0]) / _DISPLAY - 1e-9)
+        high = _DISPLAY * math.floor((high - beyond[1]) / _DISPLAY + 1e-9)
+    return None
 
 
 def seconds(settings: LinearPositioningSettings) -> float:

@@ -46,12 +46,13 @@ def complete(answers: Answers, ask: Ask) -> None:
 def _instruments(answers: Answers, ask: Ask) -> None:
     drivers = {cls.info.id: cls.info for cls in plugins.loaded("instruments")}
     show("\nInstruments:")
-    for identity, info in sorted(drivers.items(), key=lambda item: (item[1].kind, item[0])):
-        show(f"  {identity:<20} {info.summary}")
+    order = [identity for identity, _ in sorted(drivers.items(), key=lambda item: (item[1].kind, item[0]))]
+    for number, identity in enumerate(order, start=1):
+        show(f"  {number:>2}  {identity:<20} {drivers[identity].summary}")
     if ports := _ports():
         show(f"Serial ports of this computer: {', '.join(ports)}")
     while True:
-        driver = _checked("Id of an instrument (empty: no more)", ask, lambda text: _known(text, drivers))
+        driver = _chosen("Number or id of an instrument (empty: no more)", ask, order)
         if not driver:
             return
         kind = drivers[driver].kind
@@ -70,11 +71,11 @@ def _tests(answers: Answers, ask: Ask) -> None:
     methods = {cls.info.id: cls for cls in plugins.loaded("methods")}
     possible = {identity: cls for identity, cls in methods.items() if set(cls.needs.instruments) <= kinds}
     show("\nMethods for these instruments:" if possible else "\nNo method works with these instruments only:")
-    for identity, cls in sorted((possible or methods).items()):
+    for number, (identity, cls) in enumerate(sorted((possible or methods).items()), start=1):
         needs = "" if possible else f" (needs {', '.join(cls.needs.instruments)})"
-        show(f"  {identity:<20} {cls.info.summary}{needs}")
+        show(f"  {number:>2}  {identity:<20} {cls.info.summary}{needs}")
     while possible:
-        method = _checked("Id of a method (empty: no more)", ask, lambda text: _known(text, possible))
+        method = _chosen("Number or id of a method (empty: no more)", ask, sorted(possible))
         if not method:
             return
         name = _checked(f"Name of the test [{method}]", ask, lambda text: _new(text, answers.tests)) or method
@@ -106,6 +107,13 @@ def _checked(question: str, ask: Ask, check: Callable[[str], str]) -> str:
         if not wrong:
             return answer
         show(f"  {wrong}")
+
+
+def _chosen(question: str, ask: Ask, known: Sequence[str]) -> str:
+    """Return one of the numbered choices, which is answered by its number or itself; empty for none."""
+    numbered = {str(number): each for number, each in enumerate(known, start=1)}
+    answer = _checked(question, ask, lambda text: "" if text in numbered else _known(text, known))
+    return numbered.get(answer, answer)
 
 
 def _known(text: str, known: Any) -> str:

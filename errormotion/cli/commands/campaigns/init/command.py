@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,19 +71,27 @@ def init(
             "Expected --machine and at least one --instrument, as there is no terminal for questions.",
             code="option.missing",
         )
+    texts = _texts(answers, folder)
     try:
-        texts = _checked(answers, folder)
+        taken = _check(answers, texts)
     except ErrormotionError as error:
-        raise BenchError(f"{error}\nNothing was written.", code=error.code) from error
-    folder.mkdir(parents=True, exist_ok=True)
-    for path, text in texts.items():
-        _write(path, text, force)
+        if ask is None:
+            raise BenchError(f"{error}\nNothing was written.", code=error.code) from error
+        _save(texts, force)
+        raise BenchError(
+            f"{error}\nThe answers were written nevertheless: correct these values in the files, then "
+            f"'errormotion validate {' '.join(map(str, texts))}'",
+            code=error.code,
+        ) from error
+    _save(texts, force)
     files = [str(path) for path in texts]
     if as_json:
         show_json({"ok": True, "files": files})
         return
     for file in files:
         show(file)
+    for name, keys in taken.items():
+        show(f"Test {name}: from the machine {', '.join(keys)}")
     steps = [f"errormotion bench probe {files[0]}"]
     steps += [f"errormotion plan {files[1]}", f"errormotion run {files[1]}"] if len(files) > 1 else []
     show("\nNext:\n  " + "\n  ".join(steps))
@@ -133,16 +141,34 @@ def _stated(
     return answers
 
 
-def _checked(answers: Answers, folder: Path) -> dict[Path, str]:
-    """Return the texts of the files by path, checked by the readers of the files."""
+def _texts(answers: Answers, folder: Path) -> dict[Path, str]:
+    """Return the texts of the files by path."""
     drivers = {name: plugins.get("instruments", each.driver).Settings for name, each in answers.instruments.items()}
     methods = {name: plugins.get("methods", each.method).Settings for name, each in answers.tests.items()}
     texts = {folder / BENCH: bench_text(answers, drivers)}
-    bench = parse_bench(texts[folder / BENCH], folder / BENCH)
     if answers.tests:
         texts[folder / CAMPAIGN] = campaign_text(answers, BENCH, methods)
-        parse_campaign(texts[folder / CAMPAIGN], folder / CAMPAIGN, bench)
     return texts
+
+
+def _check(answers: Answers, texts: Mapping[Path, str]) -> dict[str, list[str]]:
+    """Check the texts by the readers of the files; return by test the settings that follow from the machine."""
+    paths = list(texts)
+    bench = parse_bench(texts[paths[0]], paths[0])
+    if len(paths) == 1:
+        return {}
+    campaign = parse_campaign(texts[paths[1]], paths[1], bench)
+    taken = {
+        test.name: sorted(test.settings.model_fields_set - set(answers.tests[test.name].settings))
+        for test in campaign.tests
+    }
+    return {name: keys for name, keys in taken.items() if keys}
+
+
+def _save(texts: Mapping[Path, str], force: bool) -> None:
+    for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, text, force)
 
 
 def _write(path: Path, text: str, force: bool) -> None:
