@@ -123,7 +123,7 @@ def test_cluster_with_another_version_is_refused(
     identify: Identify, cluster: LocalCluster, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(batch, "__version__", "99.0")
-    with pytest.raises(RunError, match=r"expected errormotion 99\.0 on every worker; tcp://.* has 0\."):
+    with raises("scheduler.version.differs"):
         identify(scheduler=str(cluster.scheduler_address))
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -248,7 +248,7 @@ def test_a_folder_of_runs_selects_those_of_the_method(plan: Callable[..., Campai
     again = identify_runs([first.path, first.raw], "ramp", ramp, tmp_path / "out", scheduler="sync")
     assert [outcome.stepped_over for outcome in again] == [True]
     (runs / "torn" / "run.json").unlink()
-    with pytest.raises(RunError, match="expected runs of the method 'spindle_drift'; found ramp"):
+    with raises("batch.method.other"):
         identify_runs([runs], "spindle_drift", settings(), tmp_path / "none", scheduler="sync")
 
 

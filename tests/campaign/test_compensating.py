@@ -378,7 +378,7 @@ def test_earlier_readings_at_an_unknown_time_are_refused(plan: BenchPlan, model:
 def test_one_machine_has_one_compensation(plan: BenchPlan, model: xr.Dataset, tmp_path: Path) -> None:
     with Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()):
         with (
-            pytest.raises(RunError, match=r"the offset output is in use .* an armed compensation of .* process \d+"),
+            raises("claim.instrument.used"),
             Compensation(plan, model, tmp_path, arm=MACHINE, clock=SimulatedClock()),
         ):
             pass

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mutants
 import pytest
+from coded import raises
 
 from errormotion.campaign.files import load_bench, load_campaign
 from errormotion.campaign.folder import RunFolder
@@ -37,7 +38,7 @@ def test_damaged_campaigns(tmp_path: Path, name: str) -> None:
 
 def test_a_run_json_that_is_nested_too_deep_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text('{"schema": "errormotion.run/1", "a": ' + "[" * 5000)
-    with pytest.raises(RunError, match=r"run\.json: is not valid JSON"):
+    with raises("run.file.no_json"):
         RunFolder.open(tmp_path)
 
 

@@ -268,7 +268,7 @@ def test_a_missing_ball_ends_the_cold_cycle(lab: Lab) -> None:
     plan, runs = lab()
     virtual = here()
     virtual.balls = virtual.balls.moved(1, (0.0, 0.3, 0.0))
-    with pytest.raises(RunError, match=r"too few good touches of B2 \(1 no trip, 3 not made\)"):
+    with raises("probing.cold.touches_too_few"):
         runner.run(plan, runs=runs)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import real_bench
+from coded import raises
 from command_line import CliRunner
 
 from errormotion import plugins
@@ -19,7 +20,7 @@ from errormotion.campaign.folder import RunFolder, list_runs
 from errormotion.campaign.planning.release import released
 from errormotion.cli.app import app
 from errormotion.cli.demo import probing
-from errormotion.errors import BenchError, RunError
+from errormotion.errors import BenchError
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(
@@ -228,7 +229,7 @@ def test_a_valid_calibration_and_that_of_an_unused_instrument_ask_nothing(
         campaign.read_text().replace("[test.settings]", 'instruments = {interferometer = "laser"}\n[test.settings]')
     )
     plan = load_campaign(campaign)
-    with pytest.raises(RunError, match="--move"):  # the next question
+    with raises("motions.not_released"):  # the next question
         runner.run(plan, runs=tmp_path / "runs")
 
 

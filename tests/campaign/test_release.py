@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import real_bench
+from coded import raises
 from forked_commands import Commands
 from terminal import Terminal
 
@@ -194,9 +195,9 @@ def test_a_continued_run_is_released_again(campaign: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         runner.run(plan, runs=runs, release=released, progress=Stopping())
     (folder,) = list_runs(runs)
-    with pytest.raises(RunError, match="--move"):
+    with raises("motions.not_released"):
         runner.resume(plan, runs=runs)
-    with pytest.raises(RunError, match="--move"):
+    with raises("motions.not_released"):
         processes.resume(folder.path)
     assert not (runs / ".background").exists()
     asked: list[str] = []

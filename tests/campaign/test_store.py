@@ -102,7 +102,7 @@ def test_inexact_packing_is_an_error(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     part = chunk(0, 10)
     part["distance"].values[0, 0] += LSB / 10
-    with pytest.raises(RunError, match=r"expected '\w+' in integer steps of 3\.1e-08"):
+    with raises("method.data.steps"):
         store.append(part)
 
 
@@ -165,7 +165,7 @@ def test_a_variable_along_both_dimensions_is_refused(tmp_path: Path) -> None:
 def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     store.append(chunk(0, 10))
-    with pytest.raises(RunError, match=r"expected the next samples at 0\.010000 s; .* from 0\.011000 s"):
+    with raises("method.data.times"):
         store.append(chunk(11, 10))
 
 

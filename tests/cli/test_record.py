@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coded import raises
 from command_line import CliRunner
 
 from errormotion.cli.app import app
@@ -160,10 +161,10 @@ def test_recordings_without_a_note_load_and_are_rejected_by_replay(folder: Path)
 
 def test_a_note_that_is_not_json_has_a_specific_error(folder: Path) -> None:
     Path("a.rec").write_text("errormotion-session/2 t a\nNOTE {\nEND 0 00000000\n")
-    with pytest.raises(ReplayError, match="note"):
+    with raises("recording.note.unreadable"):
         read_note(Path("a.rec"))
     Path("b.rec").write_text(f"{INDEX_FORMAT}\nx ../a.rec\n")
-    with pytest.raises(ReplayError, match="list of recordings"):
+    with raises("recording.form"):
         parts_of(Path("b.rec"))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coded import raises
 from command_line import CliRunner
 from forked_commands import Command, Commands
 
@@ -17,7 +18,7 @@ from errormotion.campaign.files import parse_bench
 from errormotion.cli.app import app
 from errormotion.cli.commands.instruments import simulate
 from errormotion.cli.commands.plugins.listing import group_of
-from errormotion.errors import InstrumentError, InstrumentTimeoutError
+from errormotion.errors import InstrumentTimeoutError
 from errormotion.instruments.line_profiler.keyence_ljx.driver import KeyenceLJX
 from errormotion.instruments.thermometer.dcon import DconSettings, DconTemperature
 from errormotion.instruments.thermometer.modbus_temperature import ModbusTemperature
@@ -186,7 +187,7 @@ def test_a_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         address = parse_address(f"sim://cframe/thermometer?port={port}")
-        with pytest.raises(InstrumentError, match=f"cannot listen at 127.0.0.1:{port}"):
+        with raises("simulator.not_listening"):
             load_simulator(get("instruments", "dcon_temperature").info.simulator, address.url)(address)
 
 

@@ -19,13 +19,13 @@ import pytest
 
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
+from coded import raises
 from tornado.web import Application
 
 from errormotion.dashboard.access import access_for
 from errormotion.dashboard.lab import Lab
 from errormotion.dashboard.pages.page import Context, Guarded
 from errormotion.dashboard.server import Options, application, run
-from errormotion.errors import RunError
 
 PAGES = ["/", "/now", "/results", "/run", "/compare", "/compensate", "/compensate/effect", "/nowhere"]
 DATA = [
@@ -150,16 +150,16 @@ def test_values_and_data_are_sent_whole(open_to_this_computer: Any, runs: Path, 
 
 
 def test_a_certificate_needs_its_key(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match="expected both"):
+    with raises("server.certificate.half"):
         run(Options(tmp_path, cert=tmp_path / "a.pem"), lambda *_: None)
-    with pytest.raises(RunError, match="cannot be used as certificate and key"):
+    with raises("server.certificate.unusable"):
         run(Options(tmp_path, cert=tmp_path / "a.pem", key=tmp_path / "b.pem"), lambda *_: None)
 
 
 @pytest.mark.filterwarnings("ignore:Exception ignored in. <socket")
 def test_an_address_in_use_is_named(open_to_this_computer: Any, tmp_path: Path) -> None:
     port = int(open_to_this_computer.address.rstrip("/").rpartition(":")[2])
-    with pytest.raises(RunError, match=f"port {port}: the server cannot listen"):
+    with raises("server.not_listening"):
         run(Options(tmp_path, port=port), lambda *_: None)
     gc.collect()  # tornado leaves the socket that it could not bind to the collector
 

@@ -13,12 +13,13 @@ import xarray as xr
 
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
+from coded import raises
+
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
 from errormotion.dashboard.space import drawing, has_volume
 from errormotion.datasets import provenance
 from errormotion.datasets.results.build import build_errors
-from errormotion.errors import DatasetError
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_arrows_are_the_errors_at_the_functional_point(volume: xr.Dataset) -> No
 
 def test_a_dataset_without_volume_is_an_error(volume: xr.Dataset) -> None:
     assert not has_volume(volume.drop_vars("x"))
-    with pytest.raises(DatasetError, match="at targets"):
+    with raises("space.no_targets"):
         drawing(volume.drop_vars("x"))
 
 

@@ -4,10 +4,10 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from coded import raises
 
 from errormotion.datasets.files.reading import DEEPEST, parse_json, read_bytes
 from errormotion.datasets.files.runfile import SCHEMA, read_run
-from errormotion.errors import RunError
 
 
 def test_a_small_file_takes_little_memory_with_any_limit(tmp_path: Path) -> None:
@@ -40,5 +40,5 @@ def test_a_nested_run_json_is_refused_with_its_name(tmp_path: Path) -> None:
     """Python reads 900 levels, but a recursion over them raises a RecursionError."""
     deep = '{"a":' * 900 + "1" + "}" * 900
     (tmp_path / "run.json").write_text(f'{{"schema": "{SCHEMA}", "x": {deep}}}')
-    with pytest.raises(RunError, match=r"run\.json: is not valid JSON \(nested too deeply"):
+    with raises("run.file.no_json"):
         read_run(tmp_path)

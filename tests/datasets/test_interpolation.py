@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets
 from errormotion.errors import DatasetError
@@ -114,5 +115,5 @@ def test_positions_of_an_axis():
 def test_wrong_instants_are_refused(times, message):
     with pytest.raises(DatasetError, match=message):
         made(np.arange(3.0), np.zeros((3, 6)), 1e-8).em.to_times(times)
-    with pytest.raises(DatasetError, match="Expected one coordinate along 'position'; found none"):
+    with raises("errors.coordinate.ambiguous"):
         made(np.arange(3.0), np.zeros((3, 6)), 1e-8).em.to_positions([0.0])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.datasets.importing import import_files
 from errormotion.errors import DatasetError
@@ -141,7 +142,7 @@ def test_temperatures_of_another_file_are_interpolated_to_the_readings(imported)
 
 def test_dates_in_one_file_only_are_refused(imported) -> None:
     text = DRIFT + '[[tables]]\n[tables.columns]\ntime = "t"\ntemperature = {frame = "T"}\n'
-    with pytest.raises(DatasetError, match="dates in both files"):
+    with raises("map.times"):
         imported(text, log=LOG, warm="t,T [degC]\n2026-05-04 10:00:00,20\n2026-05-04 10:01:00,22\n")
 
 
@@ -171,5 +172,5 @@ def test_mistakes_name_the_key(imported, text: str, log: str, message: str) -> N
 
 
 def test_a_map_of_one_file_does_not_take_two(imported) -> None:
-    with pytest.raises(DatasetError, match="expected 1 files, one for each table of the map; found 2"):
+    with raises("map.files"):
         imported(DRIFT, log=LOG, other=LOG)

@@ -118,7 +118,7 @@ def test_units_have_a_prefix_and_a_zero() -> None:
 
 @pytest.mark.parametrize("digits", [-1, 10, 255])
 def test_an_impossible_number_of_digits_is_refused(digits: int) -> None:
-    with pytest.raises(ProtocolError, match="0x6132: expected 0 to 9 decimal digits"):
+    with raises("protocol.reply.decimals"):
         scale_of(CELSIUS, digits)
 
 

@@ -72,7 +72,7 @@ def test_a_stated_unit_can_be_overruled() -> None:
 def test_a_node_without_units_opens_with_the_unit_of_the_settings() -> None:
     entries = {key: value for key, value in two_inputs().items() if key[0] != 0x6131}
     with a_node(entries) as (address, _):
-        with pytest.raises(InstrumentError, match=r"input 1 states no unit \(0x6131\); state it in the setting 'unit'"):
+        with raises("thermometer.unit.unknown"):
             CanTemperature(address, TWO).open()
         with CanTemperature(address, TWO.model_copy(update={"unit": "K"})) as thermometer:
             assert thermometer.read()["bed"] == pytest.approx(26.85, abs=1e-4)
@@ -120,9 +120,7 @@ def test_integers_have_their_decimal_digits(index: int, kind: int) -> None:
 def test_integers_without_digits_need_them_in_the_settings() -> None:
     entries = a_device() | {(0x6131, 1): (U32, CELSIUS), (0x7130, 1): (I16, 2031)}
     with a_node(entries) as (address, _):
-        with pytest.raises(
-            InstrumentError, match=r"states no decimal digits \(0x6132\); state them in the setting 'digits'"
-        ):
+        with raises("thermometer.digits.unknown"):
             CanTemperature(address, ONE).open()
         with CanTemperature(address, ONE.model_copy(update={"digits": 2})) as thermometer:
             assert thermometer.read() == {"air": 20.31}
@@ -146,7 +144,7 @@ def test_the_form_of_the_values_can_be_set() -> None:
             assert thermometer.read()["air"] == 20.25
         with CanTemperature(address, TWO.model_copy(update={"number": "integer 32"})) as thermometer:
             assert thermometer.read()["air"] == 20.1
-        with pytest.raises(InstrumentError, match="no input 1: 0x7130:1 does not exist"):
+        with raises("thermometer.input.missing"):
             CanTemperature(address, TWO.model_copy(update={"number": "integer 16"})).open()
 
 
@@ -165,7 +163,7 @@ def test_an_input_that_does_not_exist_is_an_error_when_the_node_is_opened() -> N
     settings = TWO.model_copy(update={"inputs": (1, 7), "unit": "degC"})
     with (
         a_node(two_inputs()) as (address, _),
-        pytest.raises(InstrumentError, match="node 9 has no input 7: 0x6130:7 or 0x9130:7 or 0x7130:7 does not exist"),
+        raises("thermometer.input.missing"),
     ):
         CanTemperature(address, settings).open()
 
@@ -174,7 +172,7 @@ def test_a_refused_value_is_an_error_with_its_abort_code() -> None:
     entries = two_inputs()
     with a_node(entries) as (address, _), CanTemperature(address, TWO) as thermometer:
         entries[0x6130, 2] = (F32, SdoAbortedError(0x08000000))
-        with pytest.raises(SdoRefusal, match="0x6130:2 is refused: Code 0x08000000, General error") as refusal:
+        with raises("can.sdo.refused") as refusal:
             thermometer.read()
         assert refusal.value.number == 0x08000000
 
@@ -182,7 +180,7 @@ def test_a_refused_value_is_an_error_with_its_abort_code() -> None:
 def test_a_node_of_another_profile_is_refused() -> None:
     with (
         a_node(two_inputs(device=401)) as (address, _),
-        pytest.raises(InstrumentError, match="node 9 follows the profile CiA 401; expected CiA 404"),
+        raises("can.profile.other"),
     ):
         CanTemperature(address, TWO).open()
 

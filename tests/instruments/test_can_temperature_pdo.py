@@ -20,8 +20,9 @@ from canopen_nodes import (
     sent,
     two_inputs,
 )
+from coded import raises
 
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentTimeoutError
 from errormotion.instruments.thermometer.can_temperature import CanSettings, CanTemperature
 from errormotion.instruments.thermometer.cia404 import CELSIUS
 from errormotion.testing import InstrumentConformance, InstrumentSubject
@@ -126,7 +127,7 @@ def test_a_node_that_sends_no_input_is_refused(how: str) -> None:
         entries[0x1800, 1] = (U32, 0x80000189)
     with (
         a_node(entries) as (address, _),
-        pytest.raises(InstrumentError, match=r"sends none of its inputs in a PDO .* map 0x6130:1, 0x6130:2 with"),
+        raises("thermometer.inputs.not_sent"),
     ):
         CanTemperature(address, TWO.model_copy(update={"transfer": "pdo"})).open()
 
@@ -139,7 +140,7 @@ def test_a_short_pdo_is_an_error() -> None:
         settings = TWO.model_copy(update={"transfer": "pdo", "sync": True})
         with (
             CanTemperature(address, settings) as thermometer,
-            pytest.raises(ProtocolError, match="a PDO with 0x6130:2 is too short; found 00 00 a2 41 00"),
+            raises("protocol.can.pdo"),
         ):
             thermometer.read()
 

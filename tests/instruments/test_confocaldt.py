@@ -7,7 +7,7 @@ import pytest
 from coded import raises
 from wire_vectors import Vector, vectors
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import ProtocolError
 from errormotion.instruments import simulators
 from errormotion.instruments.point_lds.confocaldt import ConfocalDT, ConfocalSettings, codec
 from errormotion.instruments.point_lds.confocaldt.blocks import (
@@ -41,7 +41,7 @@ def test_identity(vector: Vector) -> None:
 
 
 def test_controllers_with_another_grammar_are_refused() -> None:
-    with pytest.raises(InstrumentError, match="IFC2421"):
+    with raises("sensor.model.unknown"):
         codec.model_of({"name": "IFC2421"})
 
 
@@ -92,7 +92,7 @@ def test_blocks(vector: Vector) -> None:
 
 @layer("other")
 def test_other_values_are_refused_with_their_size(vector: Vector) -> None:
-    with pytest.raises(InstrumentError, match=f"frames of {vector.expected['size']} bytes"):
+    with raises("sensor.output.form"):
         block_decoder().feed(vector.data, last=True)
 
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 
-from errormotion.errors import ErrormotionError, ProtocolError
+from errormotion.errors import ErrormotionError
 from errormotion.instruments.point_lds.blocks import MAX_BLOCK_BYTES, BlockDecoder
 from errormotion.instruments.point_lds.capancdt import blocks as capancdt
 from errormotion.instruments.point_lds.capancdt.codec import Channel
@@ -181,7 +182,7 @@ def test_gaps_of_the_counter_are_lost_readings(of: Controller) -> None:
 @every
 def test_a_jump_of_the_counter_back_or_far_is_an_error(of: Controller) -> None:
     for counter in (0, 11 + of.longest_gap + 1):
-        with pytest.raises(ProtocolError, match="jumps from 11"):
+        with raises("protocol.counter.jump"):
             of.read(of.block(10, 1), of.block(counter, 1))
 
 

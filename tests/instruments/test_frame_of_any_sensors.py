@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 from errormotion.campaign.files import parse_bench
@@ -88,7 +89,7 @@ def test_an_instant_during_a_reading_is_lost_in_all_channels_and_counted() -> No
 def test_a_sensor_that_fails_is_named_and_leaves_no_thread() -> None:
     before = set(threading.enumerate())
     sensors = {"X1": Sensor(), "Y2": Sensor(fails=3)}
-    with pytest.raises(InstrumentError, match=r"^Channel Y2: no answer"):
+    with raises("instrument.other"):
         list(sampling.polled(sensors, 10, RATE))
     assert set(threading.enumerate()) == before
 

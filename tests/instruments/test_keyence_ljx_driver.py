@@ -13,7 +13,7 @@ from coded import raises
 from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError, ReplayError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.line_profiler.keyence_ljx import KeyenceLJX, LJXSettings, codec
 from errormotion.instruments.line_profiler.keyence_ljx.codec import StreamLayout
 from errormotion.instruments.line_profiler.keyence_ljx.decoder import StreamDecoder, StreamEndedError
@@ -128,7 +128,7 @@ def test_program_and_x_pitch_are_set_and_queried() -> None:
         (block,) = take(profiler, 1, 2)
         assert np.diff(block.x) == pytest.approx(25e-6, rel=1e-9)
         assert block.x.shape == (80,)
-        with pytest.raises(InstrumentError, match="number of a program, 0 to 15; found 16"):
+        with raises("profiler.program.number"):
             profiler.change_program(16)
         profiler.change_program(0)
         assert profiler.program() == 0
@@ -408,7 +408,7 @@ def test_a_missing_target_is_nan_with_its_reason() -> None:
 
 
 def test_checksums_that_are_always_wrong_end_in_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match="No profile of 57 words with a valid checksum"):
+    with raises("profiler.stream.damaged"):
         session(SMALL + "&fault=checksum&fault_at=8&fault_every=1")
 
 
@@ -504,7 +504,7 @@ def test_another_device_at_the_address_is_a_typed_error(answer: bytes, error: ty
 
 
 def test_a_stream_port_without_a_server_is_named(ramp: SimulatedLJX) -> None:
-    with pytest.raises(InstrumentError, match=r"No connection to tcp://127\.0\.0\.1:9"):
+    with raises("connection.not_opened"):
         KeyenceLJX(f"{ramp.url}?stream=9").open()
     with pytest.raises(InstrumentError, match=r"'stream' in .* expected a port from 1 to 65535; found 70000"):
         KeyenceLJX(f"{ramp.url}?stream=70000").open()
@@ -566,5 +566,5 @@ def test_a_changed_byte_of_the_recorded_stream_is_found(tmp_path: Path) -> None:
     lines = stream.read_text().splitlines()
     lines[1] = lines[1][:-1] + ("0" if lines[1][-1] != "0" else "1")
     stream.write_text("\n".join(lines) + "\n")
-    with pytest.raises(ReplayError, match=r"session\.stream\.rec"):
+    with raises("recording.damaged"):
         KeyenceLJX(f"replay://{recording}").open()

@@ -16,7 +16,7 @@ from errormotion.datasets.calibrations.inclination import (
     half_tilt,
     terms,
 )
-from errormotion.errors import DatasetError, InstrumentError, MethodError
+from errormotion.errors import DatasetError
 from errormotion.instruments.point_lds.compensated import CompensatedSensor
 from errormotion.instruments.point_lds.keyence_lk import KeyenceLK, LKSettings
 from errormotion.instruments.point_lds.optoncdt import OptoNCDT, OptoSettings
@@ -154,11 +154,11 @@ def test_missing_values_are_also_missing_when_compensated_and_are_counted(known)
 
 def test_a_tilt_beyond_the_calibrated_ones_is_refused_unless_permitted(known) -> None:
     with KeyenceLK("sim://cframe/lk?seed=3&readings=5") as sensor:
-        with pytest.raises(MethodError, match="beyond the steepest calibrated setting"):
+        with raises("calibration.inclination.outside"):
             CompensatedSensor(sensor, known).read(math.radians(55.0), 0.0)
         beyond = CompensatedSensor(sensor, known, extrapolate=True).read(math.radians(55.0), 0.0)
         assert float(beyond.raw) == pytest.approx(5e-3)
-        with pytest.raises(InstrumentError, match=r"found inclination nan, rotation 0\.0 rad"):
+        with raises("sensor.surface.angle"):
             CompensatedSensor(sensor, known).read(math.nan, 0.0)
 
 
@@ -197,7 +197,7 @@ def test_a_calibration_of_the_same_sensor_is_used_without_a_note(known) -> None:
 def test_a_calibration_of_another_serial_number_is_refused_unless_allowed(known) -> None:
     other = of_sensor(known, "H16")
     with numbered("H17") as sensor:
-        with pytest.raises(DatasetError, match=r"serial number H16; the sensor in use has H17\. .*allow_other_sensor"):
+        with raises("calibration.sensor.other"):
             CompensatedSensor(sensor, other)
         allowed = CompensatedSensor(sensor, other, allow_other_sensor=True)
         assert "H16" in allowed.notes[0]
@@ -208,7 +208,7 @@ def test_a_calibration_of_another_serial_number_is_refused_unless_allowed(known)
 
 def test_a_calibration_of_another_mid_range_is_refused(known) -> None:
     serial = "4711"
-    with opto() as sensor, pytest.raises(DatasetError, match=rf"mid-range is 0 mm; .*calibrated: {serial}\) is 10 mm"):
+    with opto() as sensor, raises("calibration.sensor.other"):
         CompensatedSensor(sensor, of_sensor(known, serial), allow_other_sensor=False)
 
 

@@ -115,7 +115,7 @@ def test_reads_a_pymodbus_server_over_tcp(function: int, framer: FramerType, sch
         assert thermometer.read() == {"air": 20.25, "bed": -3.5}
         assert not thermometer.identify().simulated
         thermometer.configure(ModbusSettings(channels=TWO, function=function, first=200, unit=7))
-        with pytest.raises(ModbusRefusal, match="illegal data address"):
+        with raises("modbus.refused"):
             thermometer.read()
         assert set(thermometer.flags.values()) == {"no answer"}
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from errormotion.datasets.units import EDGE
-from errormotion.errors import InstrumentError, ReplayError
+from errormotion.errors import InstrumentError
 from errormotion.instruments.line_profiler.profile_files import ProfileFiles, ProfileFileSettings
 from errormotion.instruments.line_profiler.profile_files.readers import height_map
 from errormotion.plugins.readings import Scan
@@ -259,7 +259,7 @@ def test_without_a_unit_a_file_that_names_none_is_refused(tmp_path: Path) -> Non
 
 def test_millimetres_taken_for_metres_are_detected(tmp_path: Path) -> None:
     path = write_cloud(tmp_path / "scan.ply", 1e3 * points())
-    with pytest.raises(InstrumentError, match=r"a height of 1 m; check its unit 'm'"):
+    with raises("scans.unit.implausible"):
         scan(path, ProfileFileSettings(unit="m"))
 
 
@@ -286,7 +286,7 @@ def test_heights_without_pitches_are_refused(tmp_path: Path) -> None:
 
 def test_a_feed_that_turns_is_refused(tmp_path: Path) -> None:
     there_and_back = np.concatenate([Y[:13], Y[11::-1]])
-    with pytest.raises(InstrumentError, match="y is not monotonic"):
+    with raises("scans.order"):
         scan(write_netcdf(tmp_path / "scan.nc", y=there_and_back))
 
 
@@ -308,16 +308,16 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, ascii: b
 
 def test_a_netcdf_file_without_units_or_variables_is_refused(tmp_path: Path) -> None:
     xr.Dataset({"z": ("profile", np.zeros(3))}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
-    with pytest.raises(InstrumentError, match=r"expected a variable height\(profile, point\)"):
+    with raises("scans.variable.missing"):
         scan(tmp_path / "a.nc")
     xr.Dataset({"height": (("profile", "point"), HEIGHTS)}).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
-    with pytest.raises(InstrumentError, match="height has no attribute 'units'"):
+    with raises("scans.unit.missing"):
         scan(tmp_path / "b.nc")
 
 
 def test_a_point_cloud_that_is_not_a_height_map_is_refused(tmp_path: Path) -> None:
     anywhere = np.random.default_rng(2).uniform(0, 1e-2, (500, 3))
-    with pytest.raises(InstrumentError, match="is not a height map: 500 points have"):
+    with raises("scans.no_height_map"):
         height_map(anywhere, tmp_path)
     with raises("scans.no_height_map"):
         height_map(np.concatenate([points(), points()[:1]]), tmp_path)
@@ -334,7 +334,7 @@ def test_an_address_without_files_is_refused(address: str, message: str) -> None
 
 def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "scan.stl").write_text("solid")
-    with pytest.raises(InstrumentError, match=r"expected a file of one of \.csv, \.nc, \.pcd, \.ply, \.xyz"):
+    with raises("scans.file.ending"):
         scan(tmp_path / "scan.stl", MM)
 
 
@@ -356,7 +356,7 @@ def test_a_recording_refers_to_the_unchanged_files(tmp_path: Path) -> None:
     with ProfileFiles(f"replay://{recording}") as files:
         assert (files.read() == heights).all()
     write_netcdf(path, "m")
-    with pytest.raises(ReplayError, match=r"scan\.nc has changed since it was recorded"):
+    with raises("recording.file.changed"):
         ProfileFiles(f"replay://{recording}").open()
     with raises("recording.not_created"):
         ProfileFiles(str(path), record=recording).open()

@@ -305,7 +305,7 @@ def test_another_device_is_refused() -> None:
     unit = Unit("FLUKE,8846A,1234567,08/02/10-14:53")
     with (
         listening(unit) as address,
-        pytest.raises(InstrumentError, match=r"expected one of 34970A, .* found a FLUKE 8846A"),
+        raises("instrument.model.unknown"),
     ):
         ScpiTemperature(address, pt100()).open()
     unit = Unit("FLUKE,8846A,1234567,08/02/10-14:53")
@@ -350,9 +350,7 @@ def test_a_scan_of_other_channels_is_an_error_and_the_unit_is_set_again() -> Non
     unit = Unit()
     with listening(unit) as address, ScpiTemperature(address, pt100()) as thermometer:
         unit.scan = [101]
-        with pytest.raises(
-            ProtocolError, match=r"expected one reading of each of the channels \(@101:102\); found \(@101\)"
-        ):
+        with raises("thermometer.channels.differ"):
             thermometer.read()
         assert set(thermometer.flags.values()) == {"no answer"}
         assert thermometer.read() == {"frame": 20.0, "oil": 20.0}

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.streaming import Chunk, Reader
@@ -168,7 +169,7 @@ def test_samples_may_have_any_shape(tap: Tap) -> None:
 def test_a_stream_that_ends_unexpectedly_first_returns_its_last_samples(tap: Tap, reader: Reader) -> None:
     tap.put(b"\1\2$")
     assert fill(reader, 2)[0] == [1, 2]
-    with pytest.raises(ProtocolError, match="tap: this was the last one"):
+    with raises("protocol.other"):
         fill(reader, 1)
 
 
@@ -195,6 +196,6 @@ def test_a_device_that_does_not_stop_is_a_timeout_error(tap: Tap, reader: Reader
 
     tap._receive = never_silent  # type: ignore[method-assign]
     tap.put(b"\1")
-    with pytest.raises(InstrumentTimeoutError, match=r"tap: still sending 0\.3 s after it was stopped"):
+    with raises("stream.not_stopped"):
         reader.finish(quiet=0.2, timeout=0.3)
     assert not any(thread.name == "reader-tap" for thread in threading.enumerate())

@@ -48,11 +48,11 @@ def test_points_that_leave_a_freedom_undetermined_are_refused(fit, points, messa
 def test_invalid_points_are_refused(fit):
     broken = RNG.normal(size=(20, 3))
     broken[[3, 7]] = np.nan
-    with pytest.raises(FitError, match=r"2 of 20 points are not finite \(rows 3, 7\)"):
+    with raises("shape.points.not_finite"):
         fit(broken)
-    with pytest.raises(FitError, match=r"one row for each point; found \(20,\)"):
+    with raises("shape.points.shape"):
         fit(np.zeros(20))
-    with pytest.raises(FitError, match=r"found \(3, 20\)"):
+    with raises("shape.points.shape"):
         fit(np.zeros((3, 20)))
     with raises("shape.points.form"):
         fit([("a", "b", "c")])
@@ -64,7 +64,7 @@ def test_noise_that_hides_the_radius_is_refused():
     # Sagitta 1 um on a chord of 100 mm, noise 10 um: a circle of any radius fits as well.
     x = np.linspace(-0.05, 0.05, 20)
     y = x**2 * 4e-4 + 1e-5 * np.random.default_rng(3).normal(size=20)
-    with pytest.raises(FitError, match=r"noise hides the radius|leave the circle undetermined|did not converge"):
+    with raises("shape.hidden_by_noise"):
         fit_circle(np.column_stack([x, y]))
 
 

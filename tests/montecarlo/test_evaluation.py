@@ -175,7 +175,7 @@ def test_a_stopped_evaluation_continues_where_it_was(measured, found, tmp_path, 
 def test_trials_of_another_evaluation_are_not_used(measured, tmp_path):
     with Store(tmp_path / "trials", {"seed": 1}):
         pass
-    with pytest.raises(RunError, match="another evaluation"):
+    with raises("monte_carlo.folder.other"):
         _evaluate(measured, tmp_path / "trials", scheduler="sync")
 
 

@@ -4,6 +4,7 @@ import sys
 
 import pytest
 import xarray as xr
+from coded import raises
 
 from errormotion import plugins
 from errormotion.datasets import schemas
@@ -112,7 +113,7 @@ def test_two_distributions_with_one_id_are_both_named(install):
     rivals = [plugin for plugin in plugins.available("instruments") if plugin.id == "good"]
     assert len(rivals) == 2
     assert all("one 1.2" in plugin.error and "two 1.2" in plugin.error for plugin in rivals)
-    with pytest.raises(PluginError, match="Several distributions provide the instrument 'good'"):
+    with raises("plugin.ambiguous"):
         plugins.get("instruments", "good")
 
 

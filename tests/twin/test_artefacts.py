@@ -5,7 +5,6 @@ import pytest
 from coded import raises
 from scipy.special import ndtr
 
-from errormotion.errors import BenchError
 from errormotion.kinematics.poses import displaced
 from errormotion.twin.artefacts import pieces as artefacts
 from errormotion.twin.sensors.profiler import Disturbances, Profiler
@@ -92,7 +91,7 @@ def test_tilted_ray_reaches_the_floor_of_the_pocket_farther_on():
 
 
 def test_unphysical_artefacts_are_refused():
-    with pytest.raises(BenchError, match="radius of an artefact as a positive length"):
+    with raises("virtual.artefact.length"):
         artefacts.circular_pocket(-1)
     with raises("virtual.surface.heights"), np.errstate(invalid="ignore"):
         artefacts.freeform(lambda x, y: np.sqrt(x))

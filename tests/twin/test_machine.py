@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.datasets import validate
 from errormotion.errors import BenchError
@@ -133,7 +134,7 @@ def test_twist_is_continuous_where_nothing_is_switched(warming):
 
 
 def test_unknown_machine_is_refused_with_the_known_ones():
-    with pytest.raises(BenchError, match="cframe or gantry, or a description; found"):
+    with raises("virtual.machine.unknown"):
         VirtualMachine("lathe")
 
 

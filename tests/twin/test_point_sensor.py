@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.datasets import validate
-from errormotion.errors import BenchError
 from errormotion.kinematics.beams import tilt, tilt_vector
 from errormotion.kinematics.fits import fit_plane
 from errormotion.methods.beam_direction import simulation
@@ -116,7 +116,7 @@ def test_gauge_deviates_from_its_setting_by_arcseconds_and_a_micrometre(machine:
     assert np.mean(angles**2) / (2 * gauge.angle_uncertainty**2) == pytest.approx(1.0, abs=0.21)
     assert np.mean(heights**2) / gauge.point_uncertainty**2 == pytest.approx(1.0, abs=0.3)
     np.testing.assert_array_equal(gauge.plane(0.1, 0.2)[0], gauge.plane(0.1, 0.2)[0])
-    with pytest.raises(BenchError, match="from 0 to 60 deg; found 61 deg"):
+    with raises("virtual.plane.inclination"):
         gauge.plane(61 * DEG, 0.0)
 
 

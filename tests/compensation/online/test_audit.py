@@ -55,7 +55,7 @@ def test_an_altered_log_is_recognised_and_not_continued(log: Path, alter: object
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(alter(lines)))  # type: ignore[operator]
     for use in (verify, AuditLog):
-        with pytest.raises(CompensationError, match="does not follow"):
+        with raises("audit.altered"):
             use(log)  # type: ignore[operator]
 
 
@@ -188,10 +188,10 @@ def test_an_old_log_has_no_key_and_is_not_continued(tmp_path: Path) -> None:
     path.write_bytes(computed_anew([b'{"entry": {"k": 1}}', b'{"entry": {"k": 2}}'], coded=False))
     assert check(path) == audit.Checked(Verdict.WITHOUT_KEY, *verify(path), False)
     path.write_bytes(path.read_bytes().replace(b": 2", b": 3"))
-    with pytest.raises(AuditError, match="does not follow"):
+    with raises("audit.altered"):
         verify(path)
     path.write_bytes(computed_anew([b'{"entry": {"k": 1}}'], coded=False))
-    with pytest.raises(audit.CompensationError, match="another key or none"):
+    with raises("audit.key.other"):
         AuditLog(path)
 
 

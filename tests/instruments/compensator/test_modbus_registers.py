@@ -58,7 +58,7 @@ def test_frames_on_a_serial_line(vector: Vector) -> None:
 
 
 def test_a_refused_write_is_named() -> None:
-    with pytest.raises(codec.ModbusRefusal, match="illegal data address"):
+    with raises("modbus.refused"):
         codec.decode_written("tcp", bytes.fromhex("000100000003019002"), 1, 16, 1, [1], 1)
 
 
@@ -140,7 +140,7 @@ def test_registers_that_do_not_exist_are_named_when_it_is_opened() -> None:
     settings = RegisterSettings(unit=UNIT, timeout=5.0, applied=(50, 52, 54))
     with served() as port:
         compensator = ModbusRegisters(f"modbus+tcp://127.0.0.1:{port}", settings)
-        with pytest.raises(InstrumentError, match="illegal data address"):
+        with raises("modbus.refused"):
             compensator.open()
 
 
@@ -203,7 +203,7 @@ def test_the_heartbeat_is_written_with_the_last_register() -> None:
 
 def test_a_limit_that_the_registers_cannot_hold_is_refused() -> None:
     with connected("clock=0&type=i16&scale=1e-9") as (_, compensator):
-        with pytest.raises(InstrumentError, match=r"represent offsets from 0.001 um to 32.767 um; the limit is 50 um"):
+        with raises("offset.range.too_small"):
             compensator.arm(50e-6)
         with raises("instrument.not_armed"):
             compensator.write((0.0, 0.0, 0.0))

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 from wire_vectors import Vector, vectors
@@ -39,7 +40,7 @@ def test_documented_lines(vector: Vector) -> None:
 
 @pytest.mark.parametrize("vector", vectors(DEVICE, "refused"), ids=str)
 def test_formats_that_are_not_legal(vector: Vector) -> None:
-    with pytest.raises(InstrumentError, match="expected 1 to 8 digits"):
+    with raises("machine.print.digits"):
         text(vector.data.decode())
 
 
@@ -251,7 +252,7 @@ def test_silence_and_drop_affect_lines():
 
 def test_an_invalid_block_stops_the_program_before_its_start():
     with port() as (line, here):
-        with pytest.raises(InstrumentError, match=r"Line 2 .*expected 1 to 8 digits in all; found 9"):
+        with raises("machine.print.digits"):
             here.run_program("POPEN\nDPRNT[T#3001[81]]\nPCLOS\nM30")
         here.elapse(10.0)
         assert received(line) == b""

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 
 from errormotion import datasets
 from errormotion.errors import MethodError
@@ -173,7 +174,7 @@ def test_a_path_replaces_the_strokes():
 
 
 def test_readings_that_increase_as_the_sensor_approaches_are_refused():
-    with pytest.raises(MethodError, match="Check the sign of the readings"):
+    with raises("beam.sensor.gain"):
         list(measure_planes(Bench(sign=-1.0), settings(), {}, None))
 
 
@@ -185,7 +186,7 @@ def test_a_face_that_is_not_found_is_reported_with_the_search_range():
 def test_an_incomplete_bench_is_refused_with_what_is_missing():
     bench = Bench()
     bench.stage = SimpleNamespace(state=dict)
-    with pytest.raises(MethodError, match="'controller' that can move the sensor to a position"):
+    with raises("bench.controller.no_moves"):
         list(measure_planes(bench, settings(), {}, None))
-    with pytest.raises(MethodError, match=r"layout.start .* or both layout.pivot and layout.nominal_origin"):
+    with raises("beam.search.start_unknown"):
         list(measure_planes(Bench(), settings(pivot=None), {}, None))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import MethodError
 from errormotion.methods.beam_direction.identification.planes import correlation_root, fit_planes
@@ -202,11 +203,11 @@ def test_a_stroke_within_the_noise_is_not_counted():
 
 
 def test_too_few_readings_are_refused():
-    with pytest.raises(MethodError, match="3 of 5 readings are valid; expected at least 4"):
+    with raises("beam.plane.readings_too_few"):
         fitted(np.array([1e-3, np.nan, 2e-3, np.nan, 1e-3]), STAGE[:5])
 
 
 def test_readings_too_dense_for_their_speckle_are_refused():
     stage = strokes(count=1400)
-    with pytest.raises(MethodError, match="Use fewer"):
+    with raises("beam.plane.readings_too_many"):
         fitted(stage @ G, stage, SPECKLE, robust=False)

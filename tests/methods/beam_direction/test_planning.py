@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 from beam_bound import bound
+from coded import raises
 
 from errormotion import datasets
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
-from errormotion.errors import MethodError
 from errormotion.kinematics.beams import tilt
 from errormotion.methods.beam_direction import BeamDirection, simulation
 from errormotion.methods.beam_direction.identification.inclination.calibrate import (
@@ -142,11 +142,11 @@ def test_the_limits_of_the_gauge_are_respected():
 
 
 def test_impossible_plans_are_refused():
-    with pytest.raises(MethodError, match=r"Expected two planes or more.*; found 1"):
+    with raises("beam.plan.planes_too_few"):
         design.optimise(LIMITS, PUBLISHED[:1])
-    with pytest.raises(MethodError, match=r"Expected 18 readings or more .*; found 12"):
+    with raises("beam.plan.readings_too_few"):
         design.optimise(replace(LIMITS, readings=12), PUBLISHED)
-    with pytest.raises(MethodError, match="points down to the gauge"):
+    with raises("beam.plan.no_face"):
         design.optimise(replace(LIMITS, beam=-BEAM), PUBLISHED)
 
 
@@ -241,5 +241,5 @@ def test_the_best_planes_are_those_that_the_calibration_covers(calibration):
 
 
 def test_a_plan_with_a_calibration_needs_the_orientation_of_the_sensor(calibration):
-    with pytest.raises(MethodError, match=r"layout\.triangulation_normal: expected"):
+    with raises("beam.triangulation_normal.missing"):
         BeamDirection().plan(settings(compensation=str(calibration), layout={"triangulation_normal": None}))

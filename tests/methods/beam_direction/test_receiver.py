@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets
 from errormotion.datasets.calibrations.inclination import InclinationCalibration
@@ -76,9 +77,9 @@ def test_either_normal_with_its_side_of_the_receiver_gives_the_beam(machine, cal
 def test_planes_that_contradict_the_side_of_the_receiver_are_refused(machine, calibration, seed):
     raw = simulation.raw(machine, BOTH_SIDES, seed=seed)
     assert in_uncertainties(identify(raw, calibration), machine) < 4
-    with pytest.raises(MethodError, match="contradict the stated side of the receiver"):
+    with raises("beam.receiver.contradicted"):
         identify(reversed_normal(raw), calibration)
-    with pytest.raises(MethodError, match="contradict the stated side of the receiver"):
+    with raises("beam.receiver.contradicted"):
         identify(raw.assign_attrs(receiver="left"), calibration)
 
 
@@ -122,9 +123,9 @@ def test_compensation_without_the_side_of_the_receiver_is_refused_by_name(machin
 
 
 def test_rotations_of_a_calibration_without_their_zero_are_refused_by_name(readings):
-    with pytest.raises(MethodError, match=r"^receiver_rotation: expected the rotation.*towards the receiver"):
+    with raises("inclination.receiver.missing"):
         calibrate(readings.drop_vars("receiver_rotation"))
-    with pytest.raises(MethodError, match=r"receiver_rotation: expected 0 or 180 deg.*found 90 deg"):
+    with raises("inclination.receiver.form"):
         calibrate(readings, InclinationCalibrationSettings(receiver_rotation=np.pi / 2))
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.datasets import validate
-from errormotion.errors import BenchError
 from errormotion.kinematics.beams import tilt, tilt_vector
 from errormotion.methods.beam_direction import simulation
 from errormotion.twin import VirtualMachine
@@ -126,7 +126,7 @@ def test_a_face_that_the_beam_does_not_meet_has_no_readings(machine: VirtualMach
 
 @pytest.mark.parametrize("shape", [(3,), (4, 2), (2, 5, 3)])
 def test_stage_positions_of_another_shape_are_refused(machine: VirtualMachine, shape: tuple[int, ...]) -> None:
-    with pytest.raises(BenchError, match=r"\(reading, 3\), or \(plane, reading, 3\) for 3 planes; found"):
+    with raises("simulation.stage.shape"):
         simulation.raw(machine, stage=np.zeros(shape), seed=1)
 
 
@@ -163,10 +163,10 @@ def test_the_inclination_error_on_a_bar_is_tens_of_micrometres(machine: VirtualM
 
 
 def test_a_stroke_beyond_the_bar_or_a_beam_along_it_is_refused(machine: VirtualMachine) -> None:
-    with pytest.raises(BenchError, match="below the radius of the bar, 25 mm; found 26 mm"):
+    with raises("simulation.bar.half_width"):
         simulation.raw_check_bar(machine, seed=1, half_width=26e-3)
     along = seeded_point_sensor(np.random.default_rng(0), lean=np.pi / 2, azimuth=np.pi / 2)
-    with pytest.raises(BenchError, match="parallel to it"):
+    with raises("simulation.bar.parallel"):
         simulation.raw_check_bar(machine, seed=1, sensor=along)
 
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displaced, displacement, log
 from errormotion.methods.crossbeam_scan import simulation
 from errormotion.methods.crossbeam_scan.identification import chain
@@ -207,7 +207,7 @@ def test_feed_is_along_the_machine(H):
 
 @pytest.mark.parametrize("covariance", [np.zeros((3, 3)), -np.eye(6)])
 def test_a_covariance_of_the_pose_that_is_none_is_refused(covariance):
-    with pytest.raises(MethodError, match="symmetric"):
+    with raises("scan.pose.covariance"):
         chain.root(covariance)
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.spatial.transform import RigidTransform
 
-from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.artefacts import cold_repeats, moved_artefacts
 from errormotion.methods.crossbeam_scan.identification.chain import carriage_adjoint
 from errormotion.twin import VirtualMachine
@@ -206,13 +206,13 @@ def test_large_step_is_found_with_four_artefacts():
 
 def test_wrong_inputs_are_refused():
     errors, C, _ = campaign(seed=0)
-    with pytest.raises(MethodError, match="increasing times"):
+    with raises("scan.consistency.shape"):
         moved_artefacts(CYCLES[::-1], PLACES, errors, C)
-    with pytest.raises(MethodError, match=r"\(t, n, 6\)"):
+    with raises("scan.consistency.shape"):
         moved_artefacts(CYCLES, PLACES, errors[..., :3], C)
-    with pytest.raises(MethodError, match="two standard deviations"):
+    with raises("scan.consistency.repeatability"):
         moved_artefacts(CYCLES, PLACES, errors, C, repeatability=(-1e-6, 0.0))
-    with pytest.raises(MethodError, match="between 0 and 1"):
+    with raises("scan.consistency.false_alarm"):
         cold_repeats(errors, C, false_alarm=1.0)
-    with pytest.raises(MethodError, match="leave out what is exact"):
+    with raises("smoothing.variance.not_positive"):
         moved_artefacts(CYCLES, PLACES, errors, 0 * C)

@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
@@ -169,7 +170,7 @@ def test_plan_of_the_pose_agrees_with_the_stated_uncertainty_of_the_calibration(
 
 
 def test_one_lift_does_not_determine_the_pose():
-    with pytest.raises(MethodError, match=r"expected at least two lifts of the spindle"):
+    with raises("scan.pocket.undetermined"):
         plan(procedure="profiler_pose", pocket_lifts=(0.166,), profiler_pose={"dz": -0.174})
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.spatial.transform import RigidTransform
 
 from errormotion import datasets
-from errormotion.errors import MethodError
 from errormotion.kinematics.poses import displacement
 from errormotion.methods.crossbeam_scan import CrossbeamScan, simulation
 from errormotion.methods.crossbeam_scan.identification.profiler_pose import calibration
@@ -122,7 +122,7 @@ def test_settings_give_a_pose_and_its_covariance():
 
 def test_one_lift_is_refused_unless_angles_are_known(raws):
     alone = raws[0][1].isel(scan=[0])
-    with pytest.raises(MethodError, match="needs scans at two heights of the spindle"):
+    with raises("scan.pocket.undetermined"):
         identify(alone)
     known = identify(alone, SETTINGS.model_copy(update={"angle_prior": 5e-3}))
     assert np.sqrt(known["pose_covariance"].values[0, 0]) == pytest.approx(5e-3, rel=0.05)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
@@ -56,7 +57,7 @@ def test_warm_up_moves_may_have_other_ends():
 
 
 def test_warm_up_moves_with_equal_ends_are_refused():
-    with pytest.raises(MethodError, match="two different ends"):
+    with raises("scan.warm_up.travel"):
         program_texts(SETTINGS.model_copy(update={"warm_up_travel": (0.4, 0.4)}))
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
-from errormotion.errors import MethodError
 from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings, simulation
 
 METHOD = NormalVector()
@@ -97,7 +97,7 @@ def test_ball_that_creeps_by_less_than_asked_for_is_left_alone(probed):
 def test_cold_cycle_in_which_all_is_wrong_is_refused(probed):
     _, raw = probed()
     raw["touch"][0, 1:] = np.nan
-    with pytest.raises(MethodError, match="cold cycle alone does not determine"):
+    with raises("probing.cold.undetermined"):
         METHOD.identify(raw)
 
 

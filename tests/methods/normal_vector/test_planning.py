@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from pydantic import ValidationError
 
 from errormotion.errors import MethodError
@@ -43,13 +44,13 @@ def test_plan_says_what_a_c_frame_does_not_show(probed):
 
 def test_plan_of_balls_that_do_not_do_is_refused():
     one_height = tuple(Ball(centre=(x, y, 0.1)) for x, y in ((0, 0), (0.2, 0), (0, 0.2), (0.2, 0.2)))
-    with pytest.raises(MethodError, match="different positions along Z"):
+    with raises("probing.balls.one_height"):
         METHOD.plan(NormalVectorSettings(balls=one_height, tool_axes="Z"))
     planned = METHOD.plan(NormalVectorSettings(balls=one_height, tool_axes="XYZ"))
     assert np.isfinite(sigma(planned)).all()
     assert np.isinf(planned["normals_loss"]).all()
     assert "both normals are equal" in planned.attrs["notes"][-1]
-    with pytest.raises(MethodError, match="found 0"):
+    with raises("probing.balls.too_few"):
         METHOD.plan(NormalVectorSettings())
     with pytest.raises(MethodError, match="has none"):
         METHOD.plan(NormalVectorSettings(balls=one_height, duration=60.0))

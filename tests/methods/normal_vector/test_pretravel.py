@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.arrays import Array
 from errormotion.datasets import save
@@ -17,7 +18,7 @@ from errormotion.datasets.calibrations.pretravel import (
     unit,
     violations,
 )
-from errormotion.errors import DatasetError, FitError
+from errormotion.errors import DatasetError
 from errormotion.methods.normal_vector.identification.pretravel import (
     PretravelSettings,
     calibrating_touches,
@@ -156,9 +157,9 @@ def test_only_directions_among_the_touches_are_supported() -> None:
 
 def test_too_few_or_lopsided_touches_are_refused() -> None:
     points, known, _ = touched(1)
-    with pytest.raises(FitError, match="at least 8 touches"):
+    with raises("probing.touches.too_few"):
         fit_pretravel(points[:7], known)
-    with pytest.raises(FitError, match="surround"):
+    with raises("probing.touches.one_side"):
         fit_pretravel(np.repeat(points[:1], 20, axis=0) + 1e-9 * np.eye(3)[np.arange(20) % 3], known)
 
 

@@ -6,10 +6,10 @@ import re
 import hypothesis
 import numpy as np
 import pytest
+from coded import raises
 from hypothesis import given
 from hypothesis import strategies as st
 
-from errormotion.errors import MethodError
 from errormotion.instruments.simulators.virtual_world.nc_program import interpret
 from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.acquisition import cycle
@@ -164,5 +164,5 @@ def test_the_first_touch_of_a_ball_names_it_as_a_control_can_read_it() -> None:
 
 
 def test_no_program_without_balls() -> None:
-    with pytest.raises(MethodError, match="three or more balls; found none"):
+    with raises("probing.balls.too_few"):
         NormalVector().programs(NormalVectorSettings())

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import datasets
-from errormotion.errors import BenchError, MethodError
+from errormotion.errors import BenchError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.normal_vector import NormalVector, NormalVectorSettings
 from errormotion.methods.normal_vector.simulation import raw
@@ -174,5 +175,5 @@ def test_simulated_truth_lies_within_the_stated_uncertainty(tool_axes):
 
 
 def test_simulation_without_a_machine_of_these_axes_is_refused():
-    with pytest.raises(MethodError, match="expected XYZ or Z for a simulation; found 'XZ'"):
+    with raises("probing.tool_axes.form"):
         NormalVector.simulate(NormalVectorSettings(tool_axes="XZ"), 1)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 
 from errormotion import datasets
-from errormotion.errors import MethodError
 from errormotion.kinematics.iso import DOF
 from errormotion.methods.r_test import RTest, RTestSettings
 
@@ -112,7 +112,7 @@ def test_one_sphere_on_the_axis_determines_displacements() -> None:
 def test_what_the_spheres_do_not_determine_is_unknown(place: list, freedoms: list | None) -> None:
     raw = placed(RTestSettings(), np.array(place, dtype=float))
     if freedoms is None:
-        with pytest.raises(MethodError, match="No freedom of axis C follows"):
+        with raises("rotary.freedoms.none"):
             METHOD.identify(raw)
     else:
         assert known(METHOD.identify(raw)) == freedoms
@@ -120,7 +120,7 @@ def test_what_the_spheres_do_not_determine_is_unknown(place: list, freedoms: lis
 
 def test_two_sensors_are_refused() -> None:
     raw, _ = METHOD.simulate(RTestSettings(), 0)
-    with pytest.raises(MethodError, match="fewer than three sensors"):
+    with raises("rotary.freedoms.none"):
         METHOD.identify(raw.isel(sensor=slice(0, 2)))
 
 
@@ -139,10 +139,10 @@ def test_missing_readings_leave_angles_unknown() -> None:
 def test_the_axis_is_never_assumed() -> None:
     raw, _ = METHOD.simulate(RTestSettings(), 0)
     del raw.attrs["axis"]
-    with pytest.raises(MethodError, match="'axis' of the raw data: expected A, B or C"):
+    with raises("raw.axis.unknown"):
         METHOD.identify(raw)
     head = raw.assign_attrs(axis="C", chain="workpiece-X-Y-bed-Z-C-tool")
-    with pytest.raises(MethodError, match="does not carry the workpiece"):
+    with raises("rotary.axis.no_workpiece"):
         METHOD.identify(head)
     table = raw.assign_attrs(axis="C", chain="workpiece-C-X-Y-bed-Z-tool")
     assert METHOD.identify(table).attrs["chain"] == "workpiece-C-X-Y-bed-Z-tool"
@@ -150,9 +150,9 @@ def test_the_axis_is_never_assumed() -> None:
 
 def test_angles_increase() -> None:
     raw, _ = METHOD.simulate(RTestSettings(), 0)
-    with pytest.raises(MethodError, match="angles that increase"):
+    with raises("rotary.angles.form"):
         METHOD.identify(raw.isel(angle=slice(None, None, -1)))
-    with pytest.raises(MethodError, match="at least 4 angles"):
+    with raises("rotary.angles.form"):
         METHOD.identify(raw.isel(angle=slice(0, 3)))
 
 

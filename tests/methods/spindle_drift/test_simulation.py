@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy.optimize import least_squares
 
 from errormotion.datasets import validate
-from errormotion.errors import BenchError
 from errormotion.methods.spindle_drift import simulation
 from errormotion.twin import Event, VirtualMachine, intersections
 from errormotion.twin.sensors.sensing import REPEATABILITY, SPECKLE
@@ -52,7 +52,7 @@ def test_beams_can_be_given_with_their_covariance(warming):
 
 
 def test_unknown_beams_are_refused(warming):
-    with pytest.raises(BenchError, match="'nominal'"):
+    with raises("simulation.beams.form"):
         simulation.raw_drift(warming, T, beams="drawn", seed=1)
 
 

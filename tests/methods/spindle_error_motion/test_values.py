@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion.errors import MethodError
 from errormotion.methods.spindle_error_motion import (
@@ -158,7 +159,7 @@ def test_a_vibration_near_a_multiple_of_the_speed_is_doubted(recorded):
 def test_the_opposite_sense_is_refused(recorded):
     raw = recorded(lambda q: A * np.cos(2 * q))
     raw["spindle_speed"] = raw["spindle_speed"].copy(data=-3000.0)
-    with pytest.raises(MethodError, match="opposite sense"):
+    with raises("readings.sense.opposite"):
         evaluated(raw)
 
 

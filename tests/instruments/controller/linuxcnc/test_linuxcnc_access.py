@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from coded import raises
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError
 from errormotion.instruments.compensator.linuxcnc import LinuxCNCCompensatorSettings, LinuxCNCOffset
 from errormotion.instruments.controller.linuxcnc import BRIDGE, LinuxCNC, LinuxCNCSettings
 from errormotion.instruments.controller.linuxcnc.codec import decode_welcome, encode_request, parts_of
@@ -141,7 +142,7 @@ def test_one_process_controls_and_loses_control_with_its_connection(start: Start
         hello = {"token": token.read_text().strip(), "control": True, "client": "another"}
         line.sendall(encode_request(0, "hello", hello))
         assert b'"control": true' in line.recv(1000)
-        with pytest.raises(InstrumentError, match=r"another client controls the machine \(another\)"):
+        with raises("linuxcnc.controlled_by_other"):
             LinuxCNC(f"tcp://127.0.0.1:{port}", armed).open()
     with LinuxCNC(f"tcp://127.0.0.1:{port}", armed) as machine:
         machine.enable()
@@ -219,7 +220,7 @@ def test_a_driver_replaces_its_lost_connection_and_no_namesake_does(start: Start
 
 
 def test_an_earlier_bridge_is_named_as_such() -> None:
-    with pytest.raises(ProtocolError, match=r"protocol 2.*Copy bridge.py"):
+    with raises("protocol.linuxcnc.version"):
         decode_welcome({"protocol": 1, "control": True, "controlled_by": None})
 
 
@@ -229,5 +230,5 @@ def test_a_program_is_sent_in_parts_that_fit_a_line() -> None:
     assert parts_of("") == [""]
     for part in parts_of(text):
         encode_request(1, "program_part", {"text": part})
-    with pytest.raises(InstrumentError, match="at most 65536 bytes"):
+    with raises("request.too_long"):
         encode_request(1, "run_program", {"text": "x" * 65536})

@@ -3,6 +3,7 @@
 from typing import Any
 
 import pytest
+from coded import raises
 
 from errormotion.errors import ProtocolError
 from errormotion.instruments.controller.linuxcnc import codec
@@ -182,5 +183,5 @@ def test_an_offset_that_is_not_known_is_no_offset(pins: Pins, changed: dict[str,
 
 
 def test_a_bridge_without_compensation_is_named() -> None:
-    with pytest.raises(ProtocolError, match="of a version without compensation"):
+    with raises("protocol.linuxcnc.version"):
         codec.decode_right({"protocol": 2, "control": False, "controlled_by": None})
