@@ -14,6 +14,7 @@ from errormotion.report.document import Cell, Figure, Source, Text
 from errormotion.report.elements import (
     Across,
     AgainstLimits,
+    Budget,
     Chapter,
     Column,
     Curves,
@@ -578,3 +579,10 @@ def test_a_chapter_may_have_a_drawing_beside_its_summary():
     assert Chapter("Turning", (KeyFigures(),), overview=Curves("None.", ("absent",))).made(
         Source(over_angles())
     ).overview is None  # fmt: skip
+
+
+def test_groups_of_sources_may_have_further_words_in_the_budget():
+    (table,) = Budget(words={"gain of the sensors": "gain"}).blocks(Source(over_angles()), "k")
+    assert [row[0] for row in table.rows] == [
+        *("gain", "noise, independent from angle to angle", "combined, k = 1", "expanded, k = 2"),
+    ]

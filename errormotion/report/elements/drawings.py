@@ -135,12 +135,13 @@ class Curves:
             [partial(paint, panel=panel) for panel in found], key, columns=columns,
             tall=tall, down=columns == 2, label=scale.label, legend=legend,
         )  # fmt: skip
-        caption = filled(self.caption.replace("{over}", along), ds)
+        spoken = along.replace("_", " ")
+        caption = filled(self.caption.replace("{over}", spoken), ds)
         if self.band and any(each.u is not None for each in flat):
             caption += f" {_SMOOTH if smooth is not None else _BANDS if scale.joined else _BARS}"
         if others and len(picks) < int(known.sum()):
             caption += f" Shown: {len(picks)} of {int(known.sum())} curves over {listed(others)}."
-        return [Figure(svg, caption, f"Curves over {along}: {panels.stated_spans(flat)}.")]
+        return [Figure(svg, caption, f"Curves over {spoken}: {panels.stated_spans(flat)}.")]
 
 
 @dataclass(frozen=True)

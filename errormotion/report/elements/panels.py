@@ -41,7 +41,9 @@ def sorted_along(ds: xr.Dataset, dim: str) -> tuple[Scale, np.ndarray]:
     scale = scale_of(ds, dim)
     order = np.argsort(scale.values, kind="stable")
     return scale._replace(
-        values=scale.values[order], texts=[scale.texts[k] for k in order] if scale.texts else []
+        label=scale.label.replace("_", " "),
+        values=scale.values[order],
+        texts=[scale.texts[k] for k in order] if scale.texts else [],
     ), order
 
 
@@ -164,6 +166,7 @@ def beside(axes: Axes) -> tuple[float, float]:
 def empty(axes: Axes) -> None:
     """Mark a panel without known values."""
     axes.text(0.5, 0.5, "not observed", transform=axes.transAxes, ha="center", va="center", color="#555555")
+    axes.set_xticks([])
     axes.set_yticks([])
     axes.grid(visible=False)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import xarray as xr
@@ -70,11 +70,14 @@ class Budget:
         ``place(dataset, dims, index)``: the place in words; by default ``at`` it in field units.
     noise : str
         Name of the part that is independent from place to place.
+    words : mapping of str to str
+        Further names of groups of sources on the page.
     """
 
     at: Callable[[xr.Dataset], Sequence[int] | None] = last_place
     place: Callable[[xr.Dataset, Sequence[str], Sequence[int]], str] = _at
     noise: str = ""
+    words: Mapping[str, str] = field(default_factory=dict)
 
     def blocks(self, source: Source, key: str) -> list[Block]:  # noqa: ARG002 - a table has no identifiers
         """Return the table; nothing if the dataset states no effects of sources."""
@@ -91,7 +94,8 @@ class Budget:
             along = " and ".join(WORDS.get(dim, dim) for dim in dims)
             noise = f"noise, independent from {along} to {along}"
         here = errors.isel(dict(zip(dims, index, strict=True)))
-        return [budget.table(here, place, noise or budget.readable("independent"))]
+        made = budget.table(here, place, noise or budget.readable("independent"))
+        return [replace(made, rows=[[self.words.get(str(row[0]), row[0]), *row[1:]] for row in made.rows])]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.methods.multilateration import Multilateration, simulation
-from errormotion.methods.multilateration.report.view import network, thinned
+from errormotion.methods.multilateration.report.network import longest, network, thinned
 from errormotion.report import write_report
 from errormotion.report.drawings.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
 from errormotion.twin import VirtualMachine
@@ -83,7 +83,7 @@ def html(tmp_path_factory):
 def test_all_sections_are_in_order(html):
     places = [html.index(f"<h2>{title}</h2>") for title in HEADINGS]
     assert places == sorted(places)
-    assert html.count("<figure") == 7
+    assert html.count("<figure") == 9
 
 
 def test_page_requires_no_network_and_no_script(html):
@@ -109,10 +109,12 @@ def test_ignored_reading_is_listed_without_raw_data(tmp_path):
     assert "Outliers, ignored: S2 to T021" in words(page(measured()[0], tmp_path))
 
 
-def test_result_is_not_changed():
+@pytest.mark.usefixtures("undrawn")
+def test_result_is_not_changed(tmp_path):
     errors, raw = measured()
     before = errors.copy(deep=True)
-    network(errors, raw)
+    network(errors)
+    page(errors, tmp_path, raw=raw)
     xr.testing.assert_identical(errors, before)
 
 
@@ -129,12 +131,14 @@ def test_six_rigid_motions_are_reported_as_undetermined(html):
 
 def test_longest_vector_is_that_of_the_data(html):
     net = network(measured()[0])
-    longest = net.length[net.worst]
-    assert f"third of the longest, {longest / UM:.2f} µm at {net.targets[net.worst]}" in words(html)
+    worst = longest(net)
+    size = float(net["length"][worst])
+    assert size == pytest.approx(np.linalg.norm([net[name][worst] for name in ("EX", "EY", "EZ")]))
+    assert f"third of the longest, {size / UM:.2f} µm at {net['target'].values[worst]}" in words(html)
 
 
 def test_undetermined_error_motions_are_unknown_with_the_reason(html):
-    assert html.count("not determined</text>") == sum(
+    assert html.count("not observed</text>") == sum(
         np.isnan(v.values).all() for name, v in measured()[0].data_vars.items() if re.fullmatch(r"E[XYZABC][XYZ]", name)
     )
     assert "EAZ: no effect on the reflector" in words(html)

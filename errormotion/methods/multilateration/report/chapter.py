@@ -1,202 +1,365 @@
-"""Chapter of a multilateration: errors of the volume, the network, errors of the axes, and undetermined freedoms."""
+"""Chapters of a multilateration: errors of the volume, the network, errors of the axes, and undetermined freedoms."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import xarray as xr
 
-from errormotion.kinematics.iso import DOF
-from errormotion.methods.multilateration.figures import root_mean_square
-from errormotion.methods.multilateration.report import axes, drawings, plan, quality
-from errormotion.methods.multilateration.report.view import Network, is_multilateration, network, scalar
-from errormotion.report import budget, provenance
-from errormotion.report.document import Block, Cell, KeyFigure, Part, Section, Source, Table, Text, estimate, or_dash
+from errormotion.kinematics.iso import DOF, iso_names
+from errormotion.methods.multilateration.report import drawings, plan, quality
+from errormotion.methods.multilateration.report.network import AXES, left_out, longest, network, used
+from errormotion.report.document import Block, Source, Text
+from errormotion.report.elements import (
+    PROVENANCE,
+    Budget,
+    Chapter,
+    Column,
+    Curves,
+    FigureTable,
+    KeyFigures,
+    KeyValue,
+    On,
+    Own,
+    Section,
+    Sentence,
+    Table,
+)
 from errormotion.report.fields import remarks
-from errormotion.report.text import DASH, finite, fixed, integer, significant
+from errormotion.report.text import fixed, integer, significant
 
-__all__ = ["is_multilateration", "part"]
-
-_OWN = "noise of the target's own readings"
+_UNKNOWN = "not determined at any target"
+_ABSENT = "not part of this result"
 _WORDS = {
     "stations": "stations, by the noise of the readings",
     "targets": "targets that define the datum, by the noise of the readings",
 }
-_UNKNOWN = "not determined at any target"
-_RIGID_MOTIONS = (
-    "Distances determine only the positions of the targets relative to one another. The six rigid motions of the "
-    "volume, three translations and three rotations, are not determined: the targets are fitted to their commanded "
-    "positions. An error that displaces or rotates the whole volume does not appear here, and is not in the "
-    "uncertainty."
-)
-_ROTATIONS = (
-    "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown, not zero. Rotations of the axes "
-    "are measured only as displacements of the reflector."
-)
 
 
-def part(source: Source, key: str) -> Part:
-    """Return the chapter of one result; ``key`` is a unique prefix of the identifiers of its figures."""
-    errors = source.errors
-    net = network(errors, source.raw)
-    planned = "target_uncertainty" in errors
-    volume: list[Block] = [] if planned else [_table(net)]
-    if not planned:
-        volume += [
-            drawings.vectors(net, f"{key}-vectors"),
-            drawings.slices(net, f"{key}-slices"),
-            drawings.histograms(net, f"{key}-histograms"),
-        ]
-    stations: list[Block] = [
-        drawings.layout(net, f"{key}-layout"),
-        quality.planned(errors, net) if planned else quality.stations(net),
-    ]
-    predicted = plan.blocks(errors, f"{key}-map")
-    sections = [
-        *([Section("volume", "Errors of the volume", volume)] if volume else []),
-        *([Section("map", "Predicted uncertainty", predicted)] if predicted else []),
-        Section("unseen", "Undetermined freedoms", [Text(_RIGID_MOTIONS, "warning"), Text(_ROTATIONS)]),
-        Section("stations", "Stations", stations),
-        Section("uncertainty", "Uncertainty", _uncertainty(errors, net, key)),
-    ]
-    if not planned:
-        sections += [
-            Section("axes", "Errors of the axes", axes.blocks(errors, f"{key}-axes")),
-            Section("quality", "Readings", _readings(errors, net, key)),
-        ]
-    else:
-        sections.append(Section("quality", "Remarks", _remarks(errors)))
-    sections.append(Section("provenance", "Provenance", provenance.blocks(source)))
-    title = "Expected uncertainty of a multilateration" if planned else "Volumetric errors by multilateration"
-    return Part(title, _key_figures(errors, net, planned), _summary(errors, net, planned), sections)
+def _expanded(net: xr.Dataset) -> xr.DataArray:
+    return (2 * net["worst_direction"]).assign_attrs(units="m")
 
 
-def _key_figures(errors: xr.Dataset, net: Network, planned: bool) -> list[KeyFigure]:
-    found = []
-    longest = None if planned else errors.em.largest(*DOF[:3])
-    if longest is not None:
-        value = estimate(1e6 * longest.value, 1e6 * longest.expanded, signed=False)
-        found.append(KeyFigure("longest error vector", value, "µm", f"at {net.targets[longest.place]}"))
-        value = estimate(*(1e6 * each for each in root_mean_square(errors)), signed=False)
-        found.append(KeyFigure("root mean square", value, "µm", "of the error vectors"))
-    sigma = net.worst_direction
-    if np.isfinite(sigma).any():
-        middle = Cell(significant(2e6 * finite(np.median, sigma)))
-        found.append(KeyFigure("uncertainty of the targets", middle, "µm", "U, k = 2, worst direction, median"))
-        found.append(KeyFigure("largest uncertainty", Cell(significant(2e6 * finite(np.max, sigma))), "µm", "U, k = 2"))
-    out = int((net.left_out > 0).sum())
-    if np.isfinite(net.residual).any():
-        used = int((np.isfinite(net.residual) & (net.left_out == 0)).sum())
-        found.append(KeyFigure("readings", Cell(integer(used)), "", f"used; {integer(out)} ignored"))
-    return found
+def _count(net: xr.Dataset) -> xr.DataArray | None:
+    """Return which readings are used; None without residuals."""
+    found = used(net)
+    return found.notnull().astype(float) if np.isfinite(net["residual"]).any() else None
 
 
-def _summary(errors: xr.Dataset, net: Network, planned: bool) -> list[str]:
-    known = int(np.isfinite(net.length).sum())
-    m, n = len(net.targets), len(net.stations)
-    words = [f"{integer(m)} targets" + (f" from {integer(n)} positions of the tracker." if n else ".")]
-    if planned:
-        words = [f"Planned, not measured: {words[0]}"]
-    elif known < m:
-        words.append(f"The errors of {integer(m - known)} targets are unknown.")
-    if not planned and net.worst is not None:
-        cells = [fixed(1e6 * v, 1, signed=True) for v in net.error[net.worst]]
-        words.append(f"The longest error vector is ({', '.join(cells)}) µm.")
-    sigma0, freedom = scalar(errors, "sigma0"), scalar(errors, "freedom")
-    if math.isfinite(sigma0) and freedom > 0:
-        words.append(
-            f"The scatter of the readings is {fixed(sigma0, 2)} times the stated one; there are {integer(freedom)} "
-            "more readings than unknowns."
-        )
-    elif freedom == 0:
-        words.append("There are as many readings as unknowns, so that there is no check.")
-    words.append("Translations and rotations of the whole volume are not determined.")
-    return words
+def _deviation(net: xr.Dataset) -> xr.DataArray:
+    """Return the distance of each station from its approximate position."""
+    away = net["station_place"] - net["station_nominal"]
+    return net["dead_path"].copy(data=np.linalg.norm(away.transpose("station", "direction").values, axis=1))
 
 
-def _table(net: Network) -> Table:
-    rows: list[list[Cell | str]] = []
-    columns = [*zip(("EX", "EY", "EZ"), net.error.T, net.sigma.T, strict=True), ("length", net.length, None)]
-    for name, values, sigma in columns:
-        spans = [finite(np.min, values), finite(np.max, values), float(np.sqrt(finite(np.mean, values**2)))]
-        expanded = [math.nan, math.nan] if sigma is None else [2 * finite(f, sigma) for f in (np.median, np.max)]
-        reason = "see the ellipsoids" if sigma is None else _UNKNOWN
-        rows.append(
-            [
-                name,
-                *(
-                    or_dash(fixed(1e6 * v, 2, signed=k < 2 and sigma is not None), _UNKNOWN)
-                    for k, v in enumerate(spans)
-                ),
-                *(or_dash(significant(1e6 * v), reason) for v in expanded),
-            ]
-        )
-    return Table(
-        "Errors of the targets in µm: actual minus commanded, after the best rigid fit.",
-        ["error", "lowest", "highest", "root mean square", "U (k = 2), median", "U, largest"],
-        rows,
+def _ignored(net: xr.Dataset) -> str:
+    return f"used; {integer(int((left_out(net) > 0).sum()))} ignored"
+
+
+def _volume(net: xr.Dataset) -> xr.Dataset:
+    """Return the three errors and the length of the vectors over ``error``, with U."""
+    size = net["length"].values
+    U = 2 * np.sqrt(np.diagonal(net["variance"].values, axis1=1, axis2=2).clip(0)).T
+    metre = {"units": "m"}
+    return xr.Dataset(
+        {
+            "value": (("error", "target"), np.concatenate([net["error"].values.T, size[None]]), metre),
+            "U": (("error", "target"), np.concatenate([U, np.full((1, size.size), np.nan)]), metre),
+            "why": ("error", [_UNKNOWN] * 3 + ["see the ellipsoids"]),
+        },
+        {"error": [*DOF[:3], "length"]},
     )
 
 
-def _uncertainty(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
-    found: list[Block] = [drawings.ellipsoids(net, f"{key}-ellipsoids")]
-    sigma = net.worst_direction
-    if "influence" not in errors or not np.isfinite(sigma).any():
-        return [*found, Text("The result does not state the sources of its uncertainty.", "note")]
-    worst = int(np.nanargmax(sigma))
-    table = budget.table(errors.isel(target=worst), f"at {net.targets[worst]}, the target with the largest uncertainty")
-    own = budget.readable("independent")
-    rows = [[_WORDS.get(str(row[0]), _OWN if row[0] == own else row[0]), *row[1:]] for row in table.rows]
-    found.append(replace(table, rows=rows))
-    shared = _shared(errors)
-    if shared:
-        found.append(Text(f"Of the variance of that target, {shared} is shared with other targets.", "plain"))
-    return found
+# ---------------------------------------------------------------------- summary
 
 
-def _shared(errors: xr.Dataset) -> str:
-    variance = np.asarray(errors["covariance"].transpose("target", "dof", "dof_").values, float)[:, :3, :3]
-    trace = np.trace(variance, axis1=1, axis2=2)
-    if not np.isfinite(trace).any():
-        return ""
+def _targets(net: xr.Dataset) -> str:
+    count = f"{integer(net.sizes['target'])} targets"
+    return f"{count} from {integer(net.sizes['station'])} positions of the tracker" if net.sizes["station"] else count
+
+
+def _lost(net: xr.Dataset) -> str | None:
+    lost = int((~np.isfinite(net["length"].values)).sum())
+    return f"{integer(lost)} targets" if lost else None
+
+
+def _vector(net: xr.Dataset) -> str | None:
+    worst = longest(net)
+    return ", ".join(fixed(1e6 * v, 1, signed=True) for v in net["error"].values[worst]) if worst is not None else None
+
+
+def _number(name: str, format: Callable[[float], str], size: float = 1.0) -> Callable[[xr.Dataset], str | None]:
+    """Return the reader of a scalar as text; None if it is unknown."""
+
+    def of(net: xr.Dataset) -> str | None:
+        value = float(net[name])
+        return format(value / size) if math.isfinite(value) else None
+
+    return of
+
+
+def _two(value: float) -> str:
+    return fixed(value, 2)
+
+
+# ---------------------------------------------------------------------- uncertainty
+
+
+def _worst(net: xr.Dataset) -> Sequence[int] | None:
+    sigma = net["worst_direction"].values
+    return [int(np.nanargmax(sigma))] if np.isfinite(sigma).any() else None
+
+
+def _at_worst(net: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:  # noqa: ARG001 - over targets
+    return f"at {net['target'].values[index[0]]}, the target with the largest uncertainty"
+
+
+def _shared(net: xr.Dataset) -> str | None:
+    """Return the share of the sources with a name in the variance of the target with the largest one."""
+    trace = np.trace(net["variance"].values, axis1=1, axis2=2)
+    if "influence" not in net or not np.isfinite(trace).any():
+        return None
     worst = int(np.nanargmax(trace))
-    influence = np.asarray(errors["influence"].isel(target=worst).transpose("source", "dof").values, float)[:, :3]
+    influence = net["influence"].isel(target=worst).transpose("source", "dof").values[:, :3]
     share = float(np.nansum(influence**2) / trace[worst])
-    return f"{fixed(100 * min(share, 1.0), 0)} %" if math.isfinite(share) else ""
+    return f"{fixed(100 * min(share, 1.0), 0)} %" if math.isfinite(share) else None
 
 
-def _shares(errors: xr.Dataset) -> list[tuple[str, str]]:
-    """Return the share of each cause in the variance of a reading, if there are several."""
-    found = errors.get("scatter_share")
-    if found is None or found.dims != ("cause",) or found.size < 2:
-        return []
-    names = {"stations": "tracker", "repeatability": "repeatability of the machine"}
-    causes = [str(cause) for cause in found["cause"].values]
-    return [
-        (f"share of the {names.get(cause, cause)} in the variance of a reading / %", fixed(100 * float(share), 0))
-        for cause, share in zip(causes, found.values, strict=True)
-    ]
+def _no_sources(net: xr.Dataset) -> bool:
+    return "influence" not in net or _worst(net) is None
 
 
-def _remarks(errors: xr.Dataset) -> list[Block]:
-    return [Text(note, "warning") for note in remarks(errors) if "\n" not in note]  # the map as text: drawn above
+# ---------------------------------------------------------------------- axes and readings
 
 
-def _readings(errors: xr.Dataset, net: Network, key: str) -> list[Block]:
-    facts = [
-        ("noise of a reading, as used / µm", fixed(1e6 * net.noise, 2)),
-        ("ratio of the scatter to the stated one", fixed(scalar(errors, "sigma0"), 3)),
-        ("readings minus unknowns", integer(scalar(errors, "freedom"))),
-        ("condition of the determined freedoms", significant(scalar(errors, "condition"), 3)),
-        ("repeatability of the machine / µm", fixed(1e6 * scalar(errors, "repeatability"), 2)),
-        ("its standard uncertainty / µm", fixed(1e6 * scalar(errors, "repeatability_u"), 2)),
-        *_shares(errors),
-    ]
-    rows: list[list[Cell | str]] = [[name, value] for name, value in facts if value != DASH]
-    found = [*_remarks(errors), *quality.left_out(net)]
-    found.append(quality.residuals(net, f"{key}-residuals"))
-    if rows:
-        found.append(Table("The solution.", ["quantity", "value"], rows))
-    return found
+def _motions(axis: str) -> list[str]:
+    return [iso_names(axis)[dof] for dof in DOF]
+
+
+def _unseen(net: xr.Dataset) -> str | None:
+    """Return the errors of the axes that are not determined, with the reason."""
+    square = [str(name) for name in net.data_vars if str(name)[2:3] == "0" and len(str(name)) == 4]
+    names = [name for axis in AXES for name in _motions(axis)] + sorted(square)
+    found = [(name, net[name].attrs.get("unseen", "")) for name in names if name in net]
+    return "; ".join(f"{name}: {reason}" for name, reason in found if reason) or None
+
+
+def _has_axes(net: xr.Dataset) -> bool:
+    return any(name in net for axis in AXES for name in _motions(axis))
+
+
+def _explained(good: bool) -> Sentence:
+    return Sentence(
+        "The residuals of the targets' errors after the errors of the axes are {axes_sigma0} times their uncertainty; "
+        "with about 1, the errors of the axes explain those of the targets.",
+        {"axes_sigma0": _number("axes_sigma0", _two)},
+        when=lambda net: bool(net["axes_sigma0"] < 1.5) is good,
+        kind="plain" if good else "warning",
+    )
+
+
+def _remarks(source: Source, key: str) -> list[Block]:  # noqa: ARG001 - texts have no identifiers
+    return [Text(note, "warning") for note in remarks(source.errors) if "\n" not in note]  # a map as text: drawn
+
+
+def _solution(net: xr.Dataset) -> xr.Dataset | None:
+    """Return the known numbers of the solution as text over ``quantity``."""
+    facts = {
+        "noise of a reading, as used / µm": _number("noise", _two, 1e-6)(net),
+        "ratio of the scatter to the stated one": _number("sigma0", lambda value: fixed(value, 3))(net),
+        "readings minus unknowns": _number("freedom", integer)(net),
+        "condition of the determined freedoms": _number("condition", lambda value: significant(value, 3))(net),
+        "repeatability of the machine / µm": _number("repeatability", _two, 1e-6)(net),
+        "its standard uncertainty / µm": _number("repeatability_u", _two, 1e-6)(net),
+    }
+    share = net.get("scatter_share")
+    if share is not None and share.dims == ("cause",) and share.size > 1:
+        names = {"stations": "tracker", "repeatability": "repeatability of the machine"}
+        for cause, part in zip(map(str, share["cause"].values), share.values, strict=True):
+            of = f"share of the {names.get(cause, cause)} in the variance of a reading / %"
+            facts[of] = fixed(100 * float(part), 0)
+    known = {name: value for name, value in facts.items() if value is not None}
+    return xr.Dataset({"value": ("quantity", list(known.values()))}, {"quantity": list(known)}) if known else None
+
+
+# ---------------------------------------------------------------------- parts
+
+_UNCERTAINTY = Section(
+    "uncertainty",
+    "Uncertainty",
+    (
+        Own(drawings.ellipsoids),
+        Sentence("The result does not state the sources of its uncertainty.", when=_no_sources, kind="note"),
+        Budget(_worst, _at_worst, noise="noise of the target's own readings", words=_WORDS),
+        Sentence("Of the variance of that target, {share} is shared with other targets.", {"share": _shared}),
+    ),
+)
+_UNSEEN = Section(
+    "unseen",
+    "Undetermined freedoms",
+    (
+        Sentence(
+            "Distances determine only the positions of the targets relative to one another. The six rigid motions of "
+            "the volume, three translations and three rotations, are not determined: the targets are fitted to their "
+            "commanded positions. An error that displaces or rotates the whole volume does not appear here, and is not "
+            "in the uncertainty.",
+            kind="warning",
+        ),
+        Sentence(
+            "A reflector is a point: rotations of the tool at a target, EA to EC, are unknown, not zero. Rotations of "
+            "the axes are measured only as displacements of the reflector."
+        ),
+    ),
+)
+_UNCERTAIN = (
+    KeyValue(
+        "uncertainty of the targets",
+        Column(_expanded, format="2", signed=False, reduce="median"),
+        "U, k = 2, worst direction, median",
+    ),
+    KeyValue("largest uncertainty", Column(_expanded, format="2", signed=False, reduce="highest"), "U, k = 2"),
+    KeyValue("readings", Column(_count, format="integer", reduce="sum"), _ignored),
+)
+_CHECKED = (
+    Sentence(
+        "The scatter of the readings is {sigma0} times the stated one; there are {freedom} more readings than "
+        "unknowns.",
+        {"sigma0": _number("sigma0", _two), "freedom": _number("freedom", integer)},
+        when=lambda net: bool(net["freedom"] > 0),
+    ),
+    Sentence(
+        "There are as many readings as unknowns, so that there is no check.",
+        when=lambda net: bool(net["freedom"] == 0),
+    ),
+    Sentence("Translations and rotations of the whole volume are not determined."),
+)
+_STATIONS = Table(
+    "Positions of the tracker and dead paths (zero offsets of its counter), with expanded uncertainty, k = 2. "
+    "Deviation: distance from the approximate position. Residual: root mean square.",
+    (
+        *(
+            Column("station_place", "station_covariance", "mm", {"direction": axis}, head=axis, signed=False,
+                   reason=_ABSENT)
+            for axis in "xyz"
+        ),
+        Column("dead_path", unit="mm", signed=False, reason=_ABSENT),
+        Column(_deviation, "none", "mm", head="deviation", format=".1", signed=False, reason=_ABSENT),
+        Column(_count, head="used", format="integer", reduce="sum", reason=_ABSENT),
+        Column(used, "none", "um", head="residual", format=".2", signed=False, reduce="rms", reason=_ABSENT),
+    ),
+    over="station",
+    groups=(("", 1), ("position", 3), ("", 1), ("", 1), ("readings", 2)),
+    absent="The result contains no stations.",
+)  # fmt: skip
+
+MEASURED = Chapter(
+    "Volumetric errors by multilateration",
+    (
+        KeyFigures(("largest volumetric error*", "root mean square*")),
+        On(
+            network,
+            (
+                *_UNCERTAIN,
+                Sentence("{targets}.", {"targets": _targets}),
+                Sentence("The errors of {lost} are unknown.", {"lost": _lost}),
+                Sentence("The longest error vector is ({vector}) µm.", {"vector": _vector}),
+                *_CHECKED,
+                Section(
+                    "volume",
+                    "Errors of the volume",
+                    (
+                        Table(
+                            "Errors of the targets: actual minus commanded, after the best rigid fit.",
+                            (
+                                *(
+                                    Column("value", "none", head=head, format=".2", signed=False, reduce=how,
+                                           reason=_UNKNOWN)
+                                    for head, how in (
+                                        ("lowest", "lowest"), ("highest", "highest"), ("root mean square", "rms")
+                                    )
+                                ),
+                                *(
+                                    Column("U", head=head, format="2", signed=False, reduce=how, reason="why")
+                                    for head, how in (("U (k = 2), median", "median"), ("U, largest", "highest"))
+                                ),
+                            ),
+                            over="error",
+                            of=_volume,
+                        ),
+                        Own(drawings.vectors),
+                        Own(drawings.slices),
+                        Own(drawings.histograms),
+                    ),
+                ),
+                _UNSEEN,
+                Section("stations", "Stations", (Own(drawings.layout), _STATIONS)),
+                _UNCERTAINTY,
+                Section(
+                    "axes",
+                    "Errors of the axes",
+                    (
+                        Sentence(
+                            "The errors of the axes were not estimated; the remarks state the reason if it is known.",
+                            when=lambda net: not _has_axes(net),
+                            kind="note",
+                        ),
+                        *(
+                            Curves(
+                                f"Error motions of axis {axis}. Each has a mean of zero, and straightness has no "
+                                "slope: these are rigid motions of the volume, or squareness.",
+                                _motions(axis),
+                                over=f"{axis}_position",
+                                columns=3,
+                            )
+                            for axis in AXES
+                        ),
+                        FigureTable(
+                            "Squareness of the axes' mean lines, with expanded uncertainty, k = 2.", ("squareness *",)
+                        ),
+                        Sentence(
+                            "Not determined by these targets: {unseen}. Unknown, not zero.",
+                            {"unseen": _unseen},
+                            kind="warning",
+                        ),
+                        _explained(good=True),
+                        _explained(good=False),
+                    ),
+                ),
+                Section(
+                    "quality",
+                    "Readings",
+                    (
+                        Own(_remarks),
+                        Own(quality.left_out),
+                        Own(quality.drawing),
+                        Table("The solution.", (Column("value"),), over="quantity", of=_solution),
+                    ),
+                ),
+            ),
+        ),
+        PROVENANCE,
+    ),
+)  # fmt: skip
+
+PLANNED = Chapter(
+    "Expected uncertainty of a multilateration",
+    (
+        On(
+            network,
+            (
+                *_UNCERTAIN,
+                Sentence("Planned, not measured: {targets}.", {"targets": _targets}),
+                *_CHECKED,
+                Section("map", "Predicted uncertainty", plan.PARTS),
+                _UNSEEN,
+                Section("stations", "Stations", (Own(drawings.layout), plan.STATIONS)),
+                _UNCERTAINTY,
+                Section("quality", "Remarks", (Own(_remarks),)),
+            ),
+        ),
+        PROVENANCE,
+    ),
+)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
@@ -9,28 +11,23 @@ from matplotlib.figure import Figure as Canvas
 
 from errormotion.arrays import Array
 from errormotion.report import canvas
-from errormotion.report.document import Block, Cell, Figure, Table, Text, or_dash
+from errormotion.report.document import Block, Figure, Source, Text
 from errormotion.report.drawings import maps
+from errormotion.report.elements import Column, Own, Sentence, Table
 from errormotion.report.text import finite, fixed, integer
 
 _LEVELS = 3
 _SAME = 1e-7  # m
 
 
-def blocks(errors: xr.Dataset, key: str) -> list[Block]:
-    """Return the map, its summary, and the targets to measure; an empty list if the plan has no map."""
+def drawing(source: Source, key: str) -> list[Block]:
+    """Return the map; nothing if the plan has none."""
+    errors = source.errors
     if "map_uncertainty" not in errors or errors["map_uncertainty"].dims != ("setup", "place"):
         return []
     position = np.asarray(errors["map_position"].values, float)
-    sigma = np.asarray(errors["map_uncertainty"].values, float)
     chosen = np.asarray(errors["chosen"].values == 1) if "chosen" in errors else np.zeros(len(position), bool)
-    found: list[Block] = [_map(position, sigma, chosen, key), _table(sigma, errors)]
-    if chosen.any():
-        found.append(_targets(position[chosen]))
-    if "best_layout" in errors.attrs:
-        words = "The best layout, as settings of a campaign, is the attribute best_layout of the plan's dataset"
-        found.append(Text(f"{words}; the setting planning.write writes it to a file.", "plain"))
-    return found
+    return [_map(position, np.asarray(errors["map_uncertainty"].values, float), chosen, key)]
 
 
 def _levels(z: Array) -> Array:
@@ -79,20 +76,68 @@ def _map(position: Array, sigma: Array, chosen: np.ndarray, key: str) -> Block:
     return Figure(canvas.draw(paint, key, 4.4), caption, alt)
 
 
-def _table(sigma: Array, errors: xr.Dataset) -> Table:
-    rows: list[list[Cell | str]] = []
-    for name, values in zip(("as set", "best"), sigma, strict=True):
-        figures = (finite(np.max, values), finite(np.mean, values), finite(np.min, values))
-        rows.append([name, *(or_dash(fixed(1e6 * v, 2), "unknown") for v in figures)])
-    gain = float(errors["gain"]) if "gain" in errors else float("nan")
-    words = f" Gain (minimised uncertainty as set / best): {fixed(gain, 2)}." if np.isfinite(gain) else ""
-    return Table(
-        f"Predicted standard uncertainty over the volume in µm.{words}", ["layout", "largest", "mean", "smallest"], rows
+def _setups(errors: xr.Dataset) -> xr.Dataset | None:
+    """Return the plan with the names of its layouts; None without a map."""
+    if "map_uncertainty" not in errors:
+        return None
+    return errors.assign_coords(setup=["as set", "best"]).assign(
+        map_uncertainty=errors["map_uncertainty"].assign_attrs(units="m")
     )
 
 
-def _targets(position: Array) -> Table:
-    rows: list[list[Cell | str]] = [
-        [integer(k), *(fixed(1e3 * v, 1) for v in row)] for k, row in enumerate(position, 1)
-    ]
-    return Table("Targets to measure: axis positions.", ["target", "X / mm", "Y / mm", "Z / mm"], rows)
+def _chosen(errors: xr.Dataset) -> xr.Dataset | None:
+    """Return the places to measure; None if the plan chooses none."""
+    if "chosen" not in errors or "map_position" not in errors:
+        return None
+    return errors.isel(place=np.flatnonzero(errors["chosen"].values == 1))
+
+
+def _number(errors: xr.Dataset, dims: Sequence[str], index: Sequence[int]) -> str:  # noqa: ARG001 - one dim
+    return integer(index[0] + 1)
+
+
+PARTS = (
+    Own(drawing),
+    Table(
+        "Predicted standard uncertainty over the volume.",
+        tuple(
+            Column("map_uncertainty", "none", "um", head=head, format=".2", signed=False, reduce=how, reason="unknown")
+            for head, how in (("largest", "highest"), ("mean", "mean"), ("smallest", "lowest"))
+        ),
+        over="setup",
+        head="layout",
+        of=_setups,
+    ),
+    Sentence(
+        "Gain (minimised uncertainty as set / best): {gain}.",
+        {"gain": lambda errors: fixed(float(errors["gain"]), 2) if "gain" in errors else None},
+    ),
+    Table(
+        "Targets to measure: axis positions.",
+        tuple(
+            Column("map_position", "none", "mm", {"direction": axis}, head=axis.upper(), format=".1", signed=False)
+            for axis in "xyz"
+        ),
+        over="place",
+        head="target",
+        of=_chosen,
+        place=_number,
+    ),
+    Sentence(
+        "The best layout, as settings of a campaign, is the attribute best_layout of the plan's dataset; the setting "
+        "planning.write writes it to a file.",
+        when=lambda errors: "best_layout" in errors.attrs,
+    ),
+)
+STATIONS = Table(
+    "Positions of the tracker as set (drawn above), and the best within the boxes.",
+    tuple(
+        Column(name, "none", "mm", {"direction": axis}, head=axis, format=".0", signed=False, reason="unknown")
+        for name in ("station_place", "best_place")
+        for axis in "xyz"
+    ),
+    over="station",
+    of=lambda net: net if np.isfinite(net["best_place"]).any() else None,
+    groups=(("", 1), ("as set", 3), ("best", 3)),
+    absent="The plan contains no better positions.",
+)
