@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from errormotion import datasets
 from errormotion.datasets import DOF
+from errormotion.datasets.results.merit import figures_of
 from errormotion.errors import DatasetError
 
 coordinates = st.floats(-5.0, 5.0)
@@ -202,3 +203,21 @@ def test_a_curve_is_drawn_in_um_over_minutes(errors) -> None:
 def test_a_raw_dataset_has_no_errors(drift) -> None:
     with pytest.raises(DatasetError, match="Identify a raw dataset first"):
         drift().em.twist()
+
+
+def test_a_point_in_mm_is_warned_about(errors_of_seed) -> None:
+    with pytest.warns(UserWarning, match="110 m from the origin of its frame"):
+        errors_of_seed(0).em.at([0, 0, 110])
+
+
+def test_a_reduced_covariance_is_refused(errors_of_seed) -> None:
+    with raises("errors.covariance.reduced"):
+        errors_of_seed(0).mean(keep_attrs=True).em.expanded()
+
+
+def test_the_accessor_says_what_it_holds(errors_of_seed) -> None:
+    ds = errors_of_seed(0)
+    shown = repr(ds.em)
+    assert f"by {ds.attrs['method']}" in shown
+    assert f"{len(ds.em.notes)} notes" in shown
+    assert [figure.name for figure in ds.em.figures()] == [figure.name for figure in figures_of(ds)]

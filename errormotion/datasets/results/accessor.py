@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 
     from errormotion.datasets.results.plotting.figure import Form
     from errormotion.estimation.extremes import Extremes, Largest
+    from errormotion.plugins import FigureOfMerit
 
+FAR = 10.0
+"""Distance of a functional point from the origin beyond which its coordinates are probably in mm, m."""
 INDEPENDENT = "independent"
 """Name of the independent contribution in a budget."""
 
@@ -86,6 +90,21 @@ class ErrorMotion:
         if ds.attrs.get("schema") != SCHEMA:
             raise _no_errors(ds, "'.em'")
         self._ds = ds
+
+    def __repr__(self) -> str:
+        """Return what was measured, where the errors hold, and how many notes there are."""
+        attrs, shape = self._ds.attrs, ", ".join(f"{self._ds.sizes[dim]} {dim}" for dim in self.dims)
+        point = ", ".join(f"{1e3 * x:g}" for x in np.ravel(attrs.get("functional_point", ())))
+        lines = [
+            "<em> errors of {} of {} by {}".format(
+                *(attrs.get(key, "?") for key in ("component", "machine", "method"))
+            ),
+            f"    {', '.join(self.iso_names().values())} over {shape or 'one place'}",
+            f"    at ({point}) mm in the frame {attrs.get('frame', '?')!r}",
+            f"    {len(self.notes)} notes (.notes), of which {len(self.doubts)} doubt an uncertainty (.doubts)",
+            "    .expanded()  .budget()  .figures()  .at(point)  .mean(dim)  .plot()  .to_dataframe()",
+        ]
+        return "\n".join(lines)
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -160,6 +179,11 @@ class ErrorMotion:
         point : array_like, (3,)
             m, in the dataset's frame.
 
+        Warns
+        -----
+        UserWarning
+            The point is further than 10 m from the origin: its coordinates may be in mm.
+
         Raises
         ------
         DatasetError
@@ -175,6 +199,12 @@ class ErrorMotion:
             )
         shift = target - _point(self._ds.attrs["functional_point"])
         self._check_levers(shift)
+        if np.linalg.norm(target) > FAR:
+            warnings.warn(
+                f"The point is {np.linalg.norm(target):.3g} m from the origin of its frame. Coordinates are in m; are "
+                "these in mm?",
+                stacklevel=2,
+            )
         moved = self._transformed(twists.adjoint(shift=shift))
         return moved.assign_attrs(functional_point=target)
 
@@ -374,6 +404,12 @@ class ErrorMotion:
 
         return mean(self._ds, dim)
 
+    def figures(self) -> list[FigureOfMerit]:
+        """Return the figures of merit of the method, or the last values over time; a plan has none."""
+        from errormotion.datasets.results.merit import figures_of
+
+        return figures_of(self._ds)
+
     @property
     def notes(self) -> list[str]:
         """Sentences for the reader."""
@@ -448,6 +484,15 @@ class ErrorMotion:
         return np.asarray(self._stacked(self.names), dtype=float)
 
     def _covariance(self) -> Array:
+        name = "covariance" if self.names == DOF else "deviation_variance"
+        expected = {*self.dims, *(("dof", "dof_") if name == "covariance" else ())}
+        if not expected <= set(self._ds.variables[name].dims):
+            raise DatasetError(
+                f"{name}: expected the dims {', '.join(sorted(expected))}; found "
+                f"{', '.join(map(str, self._ds.variables[name].dims)) or 'none'}, as after a reduction of the whole "
+                "dataset. The mean with its covariance is ds.em.mean(dim)",
+                code="errors.covariance.reduced",
+            )
         if self.names == DOF:
             return np.asarray(self._ds.variables["covariance"].values, dtype=float)
         return np.asarray(self._ds.variables["deviation_variance"].values, dtype=float)[..., None, None]
