@@ -170,24 +170,24 @@ def test_gap_is_refused_with_the_time_that_was_expected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "code"),
     [
-        (lambda raw: raw.drop_vars("temperature"), "expected the variables distance, temperature along 'time'"),
+        (lambda raw: raw.drop_vars("temperature"), "method.data.variables"),
         (
             lambda raw: raw.assign(extra=raw["distance"]),
-            "yielded the variable 'extra', which is missing in its first dataset",
+            "method.data.variables",
         ),
         (
             lambda raw: raw.isel(channel=slice(3)),
-            r"'distance' has the sizes \{'channel': 3\}; expected \{'channel': 5\}",
+            "method.data.sizes",
         ),
-        (lambda raw: raw.isel(time=0), "expected data along 'time'"),
+        (lambda raw: raw.isel(time=0), "method.data.dim"),
     ],
 )
-def test_an_incompatible_dataset_is_an_error(tmp_path: Path, change, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_an_incompatible_dataset_is_an_error(tmp_path: Path, change, code: str) -> None:  # type: ignore[no-untyped-def]
     store = RawStore.create(tmp_path / "raw.zarr", chunk(0, 10), "time", 0.1)
     store.append(chunk(0, 10))
-    with pytest.raises(RunError, match=message):
+    with raises(code):
         store.append(change(chunk(10, 10)))
 
 

@@ -229,21 +229,19 @@ def test_uneven_positions_require_a_step(machine: VirtualMachine) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "code"),
     [
-        ({"axis": "A"}, "axis: expected X, Y or Z; found 'A'"),
-        ({"axis": "Y", "component": "C"}, "component: expected X, Y or Z"),
-        ({"axis": "X"}, "no positions of X"),
-        ({"axis": "Y", "step": 0.0}, "a length above 0"),
-        ({"axis": "Y", "step": np.nan}, "a length above 0"),
-        ({"axis": "Y", "step": 5.0}, "fewer than two points"),
-        ({"axis": "Y", "step": 1e-6}, "expected at most 100000"),
+        ({"axis": "A"}, "table.axis.unknown"),
+        ({"axis": "Y", "component": "C"}, "table.axis.unknown"),
+        ({"axis": "X"}, "table.axis.no_positions"),
+        ({"axis": "Y", "step": 0.0}, "table.distance.not_positive"),
+        ({"axis": "Y", "step": np.nan}, "table.distance.not_positive"),
+        ({"axis": "Y", "step": 5.0}, "table.distance.too_large"),
+        ({"axis": "Y", "step": 1e-6}, "table.points.too_many"),
     ],
 )
-def test_a_choice_without_table_is_an_error(
-    machine: VirtualMachine, arguments: dict[str, object], message: str
-) -> None:
-    with pytest.raises(DatasetError, match=message):
+def test_a_choice_without_table_is_an_error(machine: VirtualMachine, arguments: dict[str, object], code: str) -> None:
+    with raises(code):
         axis_table(measured(machine), **arguments)  # type: ignore[arg-type]
 
 

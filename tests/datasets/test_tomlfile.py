@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from errormotion.datasets.files import tomlfile
 from errormotion.datasets.units import Length, Time
-from errormotion.errors import BenchError, DatasetError
+from errormotion.errors import BenchError
 
 
 class Table(BaseModel):
@@ -148,19 +148,19 @@ def test_the_nearest_name_ignores_upper_and_lower_case() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code"),
     [
-        ("a = " + "[" * 5000, "at most 32 levels"),
-        ("a = " + "{b=" * 3000, "at most 32 levels"),
-        ("a = " + "9" * 5000, "not TOML: Exceeds the limit"),
-        ("a." * 3000 + "a = 1", "keys of at most 32 parts"),
-        ('a = {"b" . ' + "'b'." * 3000 + "b = 1}", "keys of at most 32 parts"),
-        ("#" * (4 << 20) + "#", "at most 4194304 bytes"),
+        ("a = " + "[" * 5000, "toml.too_deep"),
+        ("a = " + "{b=" * 3000, "toml.too_deep"),
+        ("a = " + "9" * 5000, "toml.syntax"),
+        ("a." * 3000 + "a = 1", "toml.too_deep"),
+        ('a = {"b" . ' + "'b'." * 3000 + "b = 1}", "toml.too_deep"),
+        ("#" * (4 << 20) + "#", "toml.unreadable"),
     ],
     ids=["arrays", "tables", "digits", "dotted", "quoted", "size"],
 )
-def test_a_file_that_needs_too_many_resources_is_an_error(write, text: str, message: str) -> None:
-    with pytest.raises(DatasetError, match=message):
+def test_a_file_that_needs_too_many_resources_is_an_error(write, text: str, code: str) -> None:
+    with raises(code):
         tomlfile.read_toml(write(text))
 
 

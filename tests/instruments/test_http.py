@@ -209,23 +209,23 @@ def test_an_answer_of_one_piece_is_a_stream_of_one_part(site: Site, http: HttpTr
 
 
 @pytest.mark.parametrize(
-    ("rest", "message"),
+    ("rest", "code"),
     [
-        (b"--other\r\n\r\n", "expected the boundary"),
-        (b"--x\r\nContent-length: 2000\r\n\r\n", "part of 0 to 1000 bytes; found 2000"),
-        (b"--x\r\nContent-length: -1\r\n\r\n", "found None"),
-        (b"--x\r\nContent-type: text/xml\r\n\r\n", "found None"),
-        (b"x" * 5000, "header line of a part"),
-        (b"\r\n" * 40, "expected the boundary"),
-        (b"--x\r\n" + b"X: 1\r\n" * 200, "more than 100 lines"),
-        (b"--x\r\nContent-length: 1_0\r\n\r\n", "found None"),
+        (b"--other\r\n\r\n", "protocol.http.boundary"),
+        (b"--x\r\nContent-length: 2000\r\n\r\n", "protocol.http.length"),
+        (b"--x\r\nContent-length: -1\r\n\r\n", "protocol.http.length"),
+        (b"--x\r\nContent-type: text/xml\r\n\r\n", "protocol.http.length"),
+        (b"x" * 5000, "protocol.http.head"),
+        (b"\r\n" * 40, "protocol.http.boundary"),
+        (b"--x\r\n" + b"X: 1\r\n" * 200, "protocol.http.head"),
+        (b"--x\r\nContent-length: 1_0\r\n\r\n", "protocol.http.length"),
     ],
 )
-def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: bytes, message: str) -> None:
+def test_a_damaged_stream_is_an_error(site: Site, http: HttpTransport, rest: bytes, code: str) -> None:
     site.pages["/sample"] = [MULTIPART + b"\r\n", part(b"1"), rest]
     stream = http.parts("/sample", limit=1000)
     assert next(stream) == b"1"
-    with pytest.raises(ProtocolError, match=message):
+    with raises(code):
         next(stream)
 
 

@@ -482,21 +482,21 @@ def test_only_one_notice_before_the_first_profile_is_treated_as_late() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "error", "message"),
+    ("answer", "error", "code"),
     [
-        (b"\0\0\0\0" * 8, ProtocolError, "A reply has 28 to"),
-        (b"\xff" * 32, ProtocolError, "A reply has 28 to"),
-        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "expected 32 bytes within 0.5 s; received 31"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", ProtocolError, "A reply has 28 to"),
+        (b"\0\0\0\0" * 8, ProtocolError, "protocol.reply.length"),
+        (b"\xff" * 32, ProtocolError, "protocol.reply.length"),
+        (codec.reply(bytes(8))[:-1], InstrumentTimeoutError, "instrument.no_answer"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", ProtocolError, "protocol.reply.length"),
     ],
 )
-def test_another_device_at_the_address_is_a_typed_error(answer: bytes, error: type, message: str) -> None:
+def test_another_device_at_the_address_is_a_typed_error(answer: bytes, error: type, code: str) -> None:
     stranger = TcpServer("stranger", lambda data: stranger.send(answer))
     other = TcpServer("other", lambda data: None)
     stranger.start()
     other.start()
     try:
-        with pytest.raises(error, match=message):
+        with raises(code):
             KeyenceLJX(f"{stranger.url}?stream={other.url.rpartition(':')[2]}", FAST).open()
     finally:
         stranger.close()

@@ -104,23 +104,26 @@ def test_errors_are_identified_by_their_code_in_every_version(errors: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("document", "message"),
+    ("document", "code"),
     [
-        ("", "cannot be parsed"),
-        ("<MTConnectStreams", "cannot be parsed"),
-        ('{"json": 1}', "cannot be parsed"),
-        ('<?xml version="1.0" encoding="klingon"?><a/>', "cannot be parsed"),
-        ("<html><body/></html>", "without a header"),
-        (f"<Other>{HEADER}/></Other>", "found <Other>"),
-        ('<MTConnectStreams><Header creationTime="2025-03-01T12:00:00Z"/></MTConnectStreams>', "'instanceId'"),
-        ('<MTConnectStreams><Header creationTime="noon" instanceId="1"/></MTConnectStreams>', "such as 2025"),
-        (STREAMS.replace('sequence="7"', 'sequence="-7"'), "'sequence'"),
-        (STREAMS.replace('sequence="7"', ""), "'sequence'"),
-        (DEVICES.replace('id="xm"', ""), "id and type"),
+        ("", "protocol.xml.form"),
+        ("<MTConnectStreams", "protocol.xml.form"),
+        ('{"json": 1}', "protocol.xml.form"),
+        ('<?xml version="1.0" encoding="klingon"?><a/>', "protocol.xml.form"),
+        ("<html><body/></html>", "protocol.mtconnect.form"),
+        (f"<Other>{HEADER}/></Other>", "protocol.mtconnect.form"),
+        (
+            '<MTConnectStreams><Header creationTime="2025-03-01T12:00:00Z"/></MTConnectStreams>',
+            "protocol.mtconnect.number",
+        ),
+        ('<MTConnectStreams><Header creationTime="noon" instanceId="1"/></MTConnectStreams>', "protocol.time.form"),
+        (STREAMS.replace('sequence="7"', 'sequence="-7"'), "protocol.mtconnect.number"),
+        (STREAMS.replace('sequence="7"', ""), "protocol.mtconnect.number"),
+        (DEVICES.replace('id="xm"', ""), "protocol.mtconnect.form"),
     ],
 )
-def test_anything_else_is_a_protocol_error(document: str, message: str) -> None:
-    with pytest.raises(ProtocolError, match=message):
+def test_anything_else_is_a_protocol_error(document: str, code: str) -> None:
+    with raises(code):
         parse(document.encode())
 
 
@@ -210,21 +213,24 @@ def test_the_cost_of_a_long_namespace_is_linear() -> None:
 
 
 @pytest.mark.parametrize(
-    ("inside", "message"),
+    ("inside", "code"),
     [
-        ("<a>" * 100 + "</a>" * 100, "nested at most 64 deep"),
-        ("<a/>" * 1001, "at most 1000 elements"),
-        ("<a " + " ".join(f"b{k}=''" for k in range(100)) + "/>", "at most 64 attributes"),
-        (f"<{'a' * 300}/>", "at most 256 characters"),
-        (f"<a {'b' * 300}=''/>", "at most 256 characters"),
-        ("&a;", "cannot be parsed"),
-        (f'<P dataItemId="x" timestamp="2025-03-01T12:00:00Z" sequence="{"9" * 5000}">1</P>', "'sequence'"),
-        (f'<P dataItemId="x" timestamp="{"2" * 5000}" sequence="1">1</P>', "Expected a time"),
+        ("<a>" * 100 + "</a>" * 100, "protocol.xml.too_large"),
+        ("<a/>" * 1001, "protocol.xml.too_large"),
+        ("<a " + " ".join(f"b{k}=''" for k in range(100)) + "/>", "protocol.xml.too_large"),
+        (f"<{'a' * 300}/>", "protocol.xml.too_large"),
+        (f"<a {'b' * 300}=''/>", "protocol.xml.too_large"),
+        ("&a;", "protocol.xml.form"),
+        (
+            f'<P dataItemId="x" timestamp="2025-03-01T12:00:00Z" sequence="{"9" * 5000}">1</P>',
+            "protocol.mtconnect.number",
+        ),
+        (f'<P dataItemId="x" timestamp="{"2" * 5000}" sequence="1">1</P>', "protocol.time.form"),
     ],
 )
-def test_data_beyond_their_limit_are_refused(inside: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_beyond_their_limit_are_refused(inside: str, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(xml, "MAX_ELEMENTS", 1000)
-    with pytest.raises(ProtocolError, match=message):
+    with raises(code):
         parse(f"<MTConnectStreams>{HEADER}/>{inside}</MTConnectStreams>".encode())
 
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from errormotion.compensation.online.follower import Conditions, Follower, State
 from errormotion.compensation.online.settings import Limits
-from errormotion.errors import CompensationError
 
 LIMITS = Limits(limit="50 um", slew="1 um/s", period="1 s", hold="5 s", settle="3 s")
 HERE = np.zeros(3)
@@ -166,10 +165,11 @@ def test_no_jump_after_a_program_was_suspended_for_an_hour() -> None:
 
 
 @pytest.mark.parametrize(
-    ("applied", "message"), [([math.nan, 0, 0], "is unknown"), ([60e-6, 0, 0], "beyond the limit of 50 um")]
+    ("applied", "code"),
+    [([math.nan, 0, 0], "compensation.offset.unknown"), ([60e-6, 0, 0], "compensation.offset.beyond_limit")],
 )
-def test_a_machine_with_an_unknown_or_large_offset_is_not_armed(applied: list[float], message: str) -> None:
-    with pytest.raises(CompensationError, match=message):
+def test_a_machine_with_an_unknown_or_large_offset_is_not_armed(applied: list[float], code: str) -> None:
+    with raises(code):
         Follower(LIMITS).arm(np.array(applied))
 
 

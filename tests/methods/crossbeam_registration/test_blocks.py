@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from coded import raises
 
 from errormotion import compiling
-from errormotion.errors import MethodError
 from errormotion.methods.crossbeam_scan.identification.registration import (
     blocks,
     kernels,
@@ -205,20 +205,20 @@ def test_surface_is_exact_for_cubics_up_to_its_edge():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "code"),
     [
-        (lambda z, x, y: (z, x * 1e3, y * 1e3), "millimetres"),
-        (lambda z, x, y: (z, x, np.concatenate([y[:200], y[:200]])), "encoder"),
-        (lambda z, x, y: (z, x, np.where(np.arange(y.size) > 200, y + 5e-3, y)), "lost pulses"),
-        (lambda z, x, y: (z[:200], x, y), "shape"),
-        (lambda z, x, y: (z[:12], x, y[:12]), "at least 32 profiles"),
-        (lambda z, x, y: (np.full_like(z, np.nan), x, y), "exposure"),
-        (lambda z, x, y: (z, x, np.where(np.arange(y.size) == 7, np.nan, y)), "rise"),
+        (lambda z, x, y: (z, x * 1e3, y * 1e3), "registration.positions.unit"),
+        (lambda z, x, y: (z, x, np.concatenate([y[:200], y[:200]])), "registration.positions.order"),
+        (lambda z, x, y: (z, x, np.where(np.arange(y.size) > 200, y + 5e-3, y)), "registration.positions.uneven"),
+        (lambda z, x, y: (z[:200], x, y), "registration.heights.shape"),
+        (lambda z, x, y: (z[:12], x, y[:12]), "registration.scan.too_small"),
+        (lambda z, x, y: (np.full_like(z, np.nan), x, y), "registration.heights.missing"),
+        (lambda z, x, y: (z, x, np.where(np.arange(y.size) == 7, np.nan, y)), "registration.positions.order"),
     ],
 )
-def test_wrong_scans_are_refused_with_what_to_do(scanner, change, message):
+def test_wrong_scans_are_refused_with_what_to_do(scanner, change, code):
     z, x, y = scanner.scan(np.random.default_rng(0))
-    with pytest.raises(MethodError, match=message):
+    with raises(code):
         prepare(*change(z, x, y))
 
 

@@ -147,17 +147,17 @@ def test_one_height_does_not_determine_the_angle_a(scan_pocket, truth):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "code"),
     [
-        (lambda x, z, s: (x, z[:, :, :-1], s), "found .*3199"),
-        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "0.2 mm deep, with ten lines"),
-        (lambda x, z, s: (x, z * 1e-3, s), "Check the unit"),
-        (lambda x, z, s: (x, z[:, :6], s[:, :6]), "ten lines"),
-        (lambda x, z, s: (x, z, s + np.linspace(0, 1e-3, s.shape[1])[:, None]), "one height of the spindle"),
+        (lambda x, z, s: (x, z[:, :, :-1], s), "scan.pocket.shape"),
+        (lambda x, z, s: (x, np.where(z < 0, np.nan, z) * 0, s), "scan.pocket.not_round"),
+        (lambda x, z, s: (x, z * 1e-3, s), "scan.pocket.not_round"),
+        (lambda x, z, s: (x, z[:, :6], s[:, :6]), "scan.pocket.not_round"),
+        (lambda x, z, s: (x, z, s + np.linspace(0, 1e-3, s.shape[1])[:, None]), "scan.pocket.heights"),
     ],
 )
-def test_invalid_scans_of_a_pocket_are_refused(scan_pocket, change, message):
-    with pytest.raises(MethodError, match=message):
+def test_invalid_scans_of_a_pocket_are_refused(scan_pocket, change, code):
+    with raises(code):
         calibrate(*change(*scan_pocket(1, Disturbances.white(), lines=40)), POCKET)
 
 

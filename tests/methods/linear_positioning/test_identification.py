@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coded import raises
 from scipy import stats
 
 from errormotion.datasets.results.merit import figures_of
@@ -148,18 +149,18 @@ def test_three_runs_need_a_stated_drift(raw_of, identify):
 
 
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("change", "code"),
     [
-        (lambda raw: raw.assign_attrs(axis="C"), "attribute axis"),
-        (lambda raw: raw.assign_coords(approach=["up", "down"]), "forward, backward; found up, down"),
-        (lambda raw: raw.assign_coords(freedom=["EXY"]), "for axis X; found EXY"),
-        (lambda raw: raw.isel(target=slice(2)), "3 targets or more; found 2"),
-        (lambda raw: raw.assign(target_position=0.0 * raw["target_position"]), "found one of them twice"),
-        (lambda raw: raw.assign(deviation=raw["deviation"] * np.nan), "found none for one or more"),
+        (lambda raw: raw.assign_attrs(axis="C"), "raw.axis.unknown"),
+        (lambda raw: raw.assign_coords(approach=["up", "down"]), "position.approach.labels"),
+        (lambda raw: raw.assign_coords(freedom=["EXY"]), "position.freedoms.names"),
+        (lambda raw: raw.isel(target=slice(2)), "position.targets.too_few"),
+        (lambda raw: raw.assign(target_position=0.0 * raw["target_position"]), "position.targets.repeated"),
+        (lambda raw: raw.assign(deviation=raw["deviation"] * np.nan), "position.no_readings"),
     ],
 )
-def test_invalid_data_are_refused_with_the_reason(raw_of, identify, change, text):
-    with pytest.raises(MethodError, match=text):
+def test_invalid_data_are_refused_with_the_reason(raw_of, identify, change, code):
+    with raises(code):
         identify(change(raw_of(noisy(), P)))
 
 
