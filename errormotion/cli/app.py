@@ -102,7 +102,12 @@ def doctor(json_: options.Json = False) -> None:
         error = failure("\n".join(bad), code="doctor.findings") if bad else {}
         show_json({"ok": not bad, "findings": [f.__dict__ for f in findings], **error})
     else:
-        show(table(["", "what", "found"], [["ok" if f.ok else "BAD", f.name, f.message] for f in findings]))
+        show(
+            table(
+                ["", "what", "found"],
+                [["-" if f.absent else "ok" if f.ok else "BAD", f.name, f.message] for f in findings],
+            )
+        )
     if not all(f.ok for f in findings):
         raise typer.Exit(ERROR)
 

@@ -456,4 +456,7 @@ def test_doctor_states_how_to_install_missing_parts(run: Run, monkeypatch: pytes
     assert re.search(r"not installed: zarr>=\S+\. Install: \S+ -m pip install 'zarr>=", found["packages"].message)
     assert not found["packages"].ok
     assert found["optional: opcua"].ok
+    assert found["optional: opcua"].absent
+    assert not found["packages"].absent
+    assert re.search(r"^- +optional: opcua +not installed", run("doctor", code=1).stdout, re.MULTILINE)
     assert found["optional: opcua"].message.endswith("-m pip install 'errormotion[opcua]'")

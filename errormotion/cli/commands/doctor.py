@@ -24,11 +24,12 @@ MIN_FREE_DISK = 2 * 2**30
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check."""
+    """Result of one check; ``absent`` if it is of something optional that is not installed."""
 
     name: str
     ok: bool
     message: str
+    absent: bool = False
 
 
 def examine() -> list[Finding]:
@@ -50,6 +51,8 @@ def examine() -> list[Finding]:
     for name, check in checks:
         try:
             findings.append(Finding(name, True, check()))
+        except _AbsentError as error:
+            findings.append(Finding(name, True, str(error), absent=True))
         except Exception as error:  # noqa: BLE001 - the failure of a check is its result
             findings.append(
                 Finding(
@@ -61,6 +64,10 @@ def examine() -> list[Finding]:
                 )
             )
     return findings
+
+
+class _AbsentError(Exception):
+    """Something optional is not installed; the message states how to install it."""
 
 
 class _FailedError(Exception):
@@ -96,8 +103,9 @@ def _checks_of_extras() -> list[tuple[str, Callable[[], str]]]:
 
 
 def _extra(name: str) -> str:
-    lacking = _lacking(name)
-    return f"not installed ({', '.join(lacking)}). Install: {_pip(f'errormotion[{name}]')}" if lacking else "installed"
+    if lacking := _lacking(name):
+        raise _AbsentError(f"not installed ({', '.join(lacking)}). Install: {_pip(f'errormotion[{name}]')}")
+    return "installed"
 
 
 def _lacking(extra: str) -> list[str]:
