@@ -35,6 +35,8 @@ COVERAGE = 0.95
 """Coverage probability of the intervals of trend and steps."""
 FEWEST = 8
 """Runs without which they are taken as independent: they could not show a correlation."""
+ODDS = 0.5
+"""Logarithm of the mean likelihood of runs that are alike relative to that of independent ones, from which they are."""
 _MULTIPLES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 """Times over which runs may be alike, in mean intervals."""
 _OWN = 1e-6
@@ -104,12 +106,8 @@ def fit_runs(X: Array, y: Array, V0: Array, time: Array | None = None) -> RunFit
         C = np.asarray(np.linalg.inv(X.T @ cho_solve(factor, X)), dtype=float)
         b: Array = C @ (X.T @ cho_solve(factor, y))
         rest = y - X @ b
-        logs.append(
-            -np.log(np.diag(factor[0])).sum()
-            + 0.5 * np.linalg.slogdet(C)[1]
-            - 0.5 * (n - p) * np.log(max(float(rest @ cho_solve(factor, rest)), 1e-300))
-            + prior
-        )
+        square = float(rest @ cho_solve(factor, rest))
+        logs.append(_restricted(2.0 * float(np.log(np.diag(factor[0])).sum()), C, square, n - p) + prior)
         fits.append((b, C, tau))
     weight = np.exp(np.array(logs) - max(logs))
     weight /= weight.sum()
@@ -125,6 +123,44 @@ def fit_runs(X: Array, y: Array, V0: Array, time: Array | None = None) -> RunFit
     return RunFit(
         mean, half_width, whole, tau, chi2, below, n - p, fitted, quantile * spread, durations[best][0] if tau else 0.0
     )
+
+
+def _restricted(log_determinant: float, C: Array, square: float, degrees: int) -> float:
+    """Return the restricted log likelihood of a covariance whose scale is eliminated.
+
+    ``C`` is the covariance of the parameters, and ``square`` the sum of squares of the residuals.
+    """
+    return float(-0.5 * log_determinant + 0.5 * np.linalg.slogdet(C)[1] - 0.5 * degrees * np.log(max(square, 1e-300)))
+
+
+def variations(X: Array, y: Array, V0: Array, time: Array, tau: float) -> list[tuple[float, float, float]]:
+    """Return possible variations between runs: standard deviation, time T over which they are alike, and weight.
+
+    Runs are independent, with ``tau``, unless the mean likelihood of runs that are alike exceeds theirs by e^`ODDS`.
+
+    Parameters
+    ----------
+    X, y, V0, time
+        See `fit_runs`.
+    tau : float
+        Standard deviation between independent runs.
+    """
+    n, p = X.shape
+    possible, logs = list[tuple[float, float]](), list[float]()
+    for T, prior in alike(time, n) if n > p else ():
+        R = correlation(time, n, T)
+        size = paule_mandel(X, y, V0, R)
+        V = V0 + size**2 * R
+        WX, Wy = np.linalg.solve(V, X), np.linalg.solve(V, y)
+        C = np.linalg.inv(X.T @ WX)
+        square = float((y - X @ (C @ (X.T @ Wy))) @ Wy)
+        possible.append((size if T else tau, T))
+        logs.append(_restricted(float(np.linalg.slogdet(V)[1]), C, square, n - p) + prior)
+    if len(logs) < 2 or np.log(np.mean(np.exp(np.array(logs[1:]) - logs[0]))) < ODDS:
+        return [(tau, 0.0, 1.0)]
+    weight = np.exp(np.array(logs) - max(logs))
+    weight /= weight.sum()
+    return [(size, T, float(w)) for (size, T), w in zip(possible, weight, strict=True)]
 
 
 def alike(time: Array | None, n: int) -> list[tuple[float, float]]:

@@ -4,12 +4,16 @@ Between two steps the centre is the generalised mean of the values without outli
 ``V = V0 + tau^2``: V0 is the covariance that the runs state, and tau the reproducibility of machine and set-up from the
 moving ranges. The limits are three standard deviations of the difference from this centre,
 ``Var(y_k - w'y) = V_kk - 2 (V w)_k + w'V w``: each value has its own limits, and a source that all runs share cancels.
+Runs that are alike over some time, as machines age and sites have seasons, have smaller moving ranges than values. If
+the values show this, V contains the correlation (`errormotion.estimation.between_runs`); centre and variance are then
+means over its possible times, and the variance contains the differences between the centres.
 The limit of a moving range is its expectation plus three standard deviations, for normal values
 ``(sqrt(2 / pi) + 3 sqrt(1 - 2 / pi)) sd = 2.606 sd``, where sd is that of the difference.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errormotion.arrays import Array
-from errormotion.estimation.between_runs import by_moving_ranges, difference_variance
+from errormotion.estimation.between_runs import by_moving_ranges, correlation, difference_variance, variations
 from errormotion.record.series import Series
 from errormotion.record.steps import Model
 
@@ -27,7 +31,7 @@ WIDTH = 3.0
 
 @dataclass(frozen=True)
 class Chart:
-    """Centre and limits of each value (n,), moving ranges and their limits (n - 1,), and tau; SI.
+    """Centre and limits of each value (n,), moving ranges and their limits (n - 1,), and tau of the ranges; SI.
 
     A range across a step is NaN.
     """
@@ -55,18 +59,34 @@ def chart(series: Series, model: Model) -> Chart:
     for k in model.departing:
         used[max(k - 1, 0) : k + 1] = False
     tau = by_moving_ranges(y, series.covariance, used)
-    V = series.covariance + tau**2 * np.eye(n)
-    centre, width = np.empty(n), np.empty(n)
+    kept = np.setdiff1d(np.arange(n), model.departing)
+    parts = np.array([(first <= kept) & (kept < last) for first, last in pairwise(bounds)], dtype=float).T
+    V0, t = series.covariance, series.time
+    # about the trend, against which the limits stand
+    X = np.column_stack([parts[:, parts.any(axis=0)], series.years[kept]])
+    X = X if np.linalg.matrix_rank(X) == X.shape[1] else X[:, :-1]
+    possible = variations(X, y[kept], V0[np.ix_(kept, kept)], t[kept], tau)
+    weight = np.array([share for _, _, share in possible])
+    each = [V0 + size**2 * correlation(t, n, T) for size, T, _ in possible]
+    centres, variances = (np.array(rows) for rows in zip(*(_centred(y, V, bounds, model) for V in each), strict=True))
+    centre = weight @ centres
+    width = WIDTH * np.sqrt(np.maximum(weight @ (variances + (centres - centre) ** 2), 0.0))
+    of_ranges = np.sqrt(weight @ np.array([difference_variance(V) for V in each]))
+    limit = (np.sqrt(2 / np.pi) + WIDTH * np.sqrt(1 - 2 / np.pi)) * of_ranges
+    ranges = np.where(whole, np.abs(np.diff(y)), np.nan)
+    return Chart(centre, centre - width, centre + width, ranges, limit, tau)
+
+
+def _centred(y: Array, V: Array, bounds: Sequence[int], model: Model) -> tuple[Array, Array]:
+    """Return the centre of each value, (n,), and the variance of its difference from it."""
+    centre, variance = np.empty(len(y)), np.empty(len(y))
     for first, last in pairwise(bounds):
         inside = np.arange(first, last)
         kept = np.setdiff1d(inside, model.departing)
         kept = kept if kept.size else inside
-        w = np.zeros(n)
+        w = np.zeros(len(y))
         w[kept] = np.linalg.solve(V[np.ix_(kept, kept)], np.ones(kept.size))
         w /= w.sum()
         centre[inside] = w @ y
-        variance = np.diag(V) - 2 * V @ w + w @ V @ w
-        width[inside] = WIDTH * np.sqrt(np.maximum(variance[inside], 0.0))
-    limit = (np.sqrt(2 / np.pi) + WIDTH * np.sqrt(1 - 2 / np.pi)) * np.sqrt(difference_variance(V))
-    ranges = np.where(whole, np.abs(np.diff(y)), np.nan)
-    return Chart(centre, centre - width, centre + width, ranges, limit, tau)
+        variance[inside] = (np.diag(V) - 2 * V @ w + w @ V @ w)[inside]
+    return centre, variance

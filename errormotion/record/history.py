@@ -59,7 +59,11 @@ TABLE: dict[str, tuple[tuple[str, ...], str, str]] = {
     "trend_low": ((), "figure", "lower end of its interval"),
     "trend_high": ((), "figure", "upper end of its interval"),
     "reproducibility": ((), "figure", "tau by Paule and Mandel: standard deviation between runs about trend and steps"),
-    "reproducibility_of_ranges": ((), "figure", "tau from the moving ranges, which the control limits hold"),
+    "reproducibility_of_ranges": (
+        (),
+        "figure",
+        "tau from the moving ranges, which the control limits hold unless runs are alike",
+    ),
     "duration": (
         (),
         "s",

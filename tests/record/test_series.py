@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import norm
 
-from errormotion.estimation.between_runs import fit_runs
+from errormotion.estimation.between_runs import by_moving_ranges, fit_runs
 from errormotion.record.control import chart
 from errormotion.record.series import YEAR, Series
 from errormotion.record.steps import Model, model_of
@@ -172,6 +173,27 @@ def test_values_in_control_are_outside_of_their_limits_as_often_as_three_sigma_s
     # tau is estimated: with 60 degrees of freedom three sigma are exceeded 1.4 times as often
     assert stated / 2 <= outside / (count * n) <= 2.5 * stated
     assert ranges / (count * (n - 1)) == pytest.approx(2 * norm.sf(2.606), abs=0.003)
+
+
+@pytest.mark.parametrize("n", [20, 60])
+def test_runs_that_are_alike_are_outside_of_their_limits_as_often_as_three_sigma_state(n: int) -> None:
+    outside, count, phi = 0, 100, 0.5
+    widths: dict[float, list[float]] = {0.0: [], phi: []}
+    for seed in range(count):
+        rng = np.random.default_rng([seed, n])
+        white = rng.normal(size=n + 100)
+        for each, widened in widths.items():
+            y = 1e-6 * lfilter([1.0], [1.0, -each], np.sqrt(1 - each**2) * white)[100:]
+            values = Series(np.arange(n) * YEAR / 12, y + 0.3e-6 * rng.normal(size=n), np.full(n, 0.3e-6))
+            limits = chart(values, Model(None))
+            tau = by_moving_ranges(values.value, values.covariance)
+            widened.append((limits.upper - limits.centre)[0] / np.sqrt(9 * (tau**2 + 0.3e-6**2) * (1 - 1 / n)))
+            outside += limits.outside(values.value).sum() if each == phi else 0
+    # by the moving ranges alone 2.5 %; those of 20 runs determine a standard deviation to a fifth
+    assert outside / (count * n) < 0.01
+    assert np.median(widths[0.0]) == pytest.approx(1.0, abs=1e-6)
+    assert np.mean(widths[0.0]) < 1.05
+    assert np.mean(widths[phi]) > 1.1
 
 
 def test_limits_follow_the_uncertainty_of_each_run_and_restart_after_a_step() -> None:
