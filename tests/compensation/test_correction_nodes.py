@@ -6,7 +6,7 @@ import xarray as xr
 from coded import raises
 
 from errormotion.compensation.correction import correction
-from errormotion.compensation.correction.nodes import Grid, Scattered, of_targets
+from errormotion.compensation.correction.nodes import Grid, Line, Scattered, of_targets
 from errormotion.datasets import build_errors, provenance
 from errormotion.twin import VirtualMachine
 
@@ -141,3 +141,18 @@ def test_the_curvature_of_scattered_errors_is_in_the_covariance() -> None:
     miss = places.weights(asked).of(bent(nodes)) - bent(asked)
     stated = np.sqrt(places.added(asked, bent(nodes), np.zeros((400, 6, 6))))
     assert 0.5 < np.sqrt((stated**2).mean() / (miss**2).mean()) < 2.0
+
+
+def test_the_uncertainty_between_two_instants_contains_a_step_there() -> None:
+    """Wherever the step is: in the middle one of 3 um deviates by half of it: 1.96 / sqrt(3) is 1.13."""
+    instants, size = np.arange(6) * 600.0, 3e-6
+    values = np.zeros((6, 4, 6))
+    values[3:] += size
+    own = np.tile(1e-18 * np.eye(6), (6, 4, 1, 1))
+    line = Line(instants)
+    at = np.array([[300.0], [1320.0], [1500.0], [1800.0], [1740.0]])
+    u = 1.96 * np.sqrt(line.added_in_time(at, values, own))
+    assert (u[[1, 2, 4]] >= size * np.array([[0.8], [0.5], [0.9]])).all()
+    assert u[[1, 2, 4]] == pytest.approx(np.tile(size * np.array([[0.8], [0.5], [0.9]]), 6), rel=0.5)
+    assert not u[[0, 3]].any()
+    assert (1.96 * np.sqrt(line.added(at, values, own))[[1, 2, 4]] < size * 0.5).all()

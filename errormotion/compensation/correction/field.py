@@ -119,7 +119,7 @@ class Field:
         if self.instants is None or time is None:
             return self.nodes.added(points, E[0], C[0])
         found = self.nodes.added(points, E.mean(axis=0), C.mean(axis=0) / T)
-        return np.asarray(found + self.instants.added(time[:, None], E, C))
+        return np.asarray(found + self.instants.added_in_time(time[:, None], E, C))
 
 
 def field_of(ds: xr.Dataset, name: str, chain: str) -> tuple[Field, list[str]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from errormotion.arrays import Array
-from errormotion.datasets.results.interpolation import intensity
+from errormotion.datasets.results.interpolation import intensity, steps, variance_beside_a_step
 
 _EDGE = 1e-6
 """Maximum distance from the hull of a point on it, relative to the distance from the mean of the nodes."""
@@ -121,6 +121,16 @@ class Line:
         before, w, _ = self._share(points[:, 0])
         between = (np.diff(self.nodes)[before] ** 3 * w**2 * (1 - w) ** 2 / 3)[:, None]
         return np.where(between > 0, between * q[before], 0.0)
+
+    def added_in_time(self, points: Array, values: Array, own: Array) -> Array:
+        """Return `added` with the variance of a step between two instants; see `datasets.results.interpolation`."""
+        added = self.added(points, values, own)
+        if self.size == 1:
+            return added
+        before, w, _ = self._share(points[:, 0])
+        square = steps(self.nodes, values, own, together=True).reshape(self.size - 1, 6)[before]
+        between = ((w > 0) & (w < 1))[:, None]
+        return np.asarray(added + np.where(between, variance_beside_a_step(w[:, None], square), 0.0))
 
     def _share(self, x: Array) -> tuple[NDArray[np.intp], Array, NDArray[np.bool_]]:
         t = self.nodes

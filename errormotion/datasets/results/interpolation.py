@@ -11,8 +11,15 @@ intervals are s and s'. The slope changes at least by the range J of these three
 slope changes by J (one standard deviation) within the interval. A single change of this size, anywhere in it, deviates
 from the line by sqrt(3) standard deviations.
 
-A step between two values, by a switched compensation or a stop, is not contained: in simulations 44 % of the 95 %
-intervals between the two held. Sources that are one draw for many values are interpolated with the same weights.
+A switched compensation, a reset or a stop makes a step somewhere between two values. The mean slope of its interval is
+then outside of those of the intervals beside it, by S over its length; a smooth curve is between them but for turns of
+its slope. A step S at any instant of the interval deviates from the line by no more than ``S max(w, 1 - w)``, which is
+taken as sqrt(3) standard deviations, as that of one change of slope. Before the first value and after the last one a
+slope of 0 is assumed. A warm-up that starts with the first interval has a slope in it that is up to e times that of the
+next, if its time constant is not shorter than an interval. This is for records over time; along positions no step is
+expected. A step of few standard deviations of a value is hidden by their noise, and not contained.
+
+Sources that are one draw for many values are interpolated with the same weights.
 Nothing is extrapolated.
 """
 
@@ -27,6 +34,8 @@ from errormotion.datasets.results.reduction import TOLERANCE, influence_of, rebu
 from errormotion.datasets.schemas import DOF, INDEX
 from errormotion.errors import DatasetError
 
+SIGNIFICANT = 3.29
+"""Size of a step in standard deviations of its noise from which it is one: one in a thousand by noise alone."""
 Places = tuple[NDArray[np.intp], Array, NDArray[np.bool_], NDArray[np.bool_]]
 """For each new point: index of the known point before it, fraction of the interval, whether it is known or inside."""
 
@@ -103,7 +112,7 @@ def interpolated(
     E, total, F : ndarray, (n, ..., 6), (n, ..., 6, 6), (source, n, ..., 6)
         Errors, total covariance, influence.
     starting : bool
-        Whether the errors are assumed to be constant before the first point.
+        For errors over time: they are assumed to be constant before the first point, and may have steps.
 
     Returns
     -------
@@ -120,6 +129,9 @@ def interpolated(
     q = np.where(between.reshape(w.shape), q[np.minimum(before, len(q) - 1)], 0.0)
     width = np.where(exact, 0.0, t[after] - t[before])
     added = (width**3 * share**2 * (1 - share) ** 2 / 3).reshape(w.shape) * q
+    if starting:
+        size = steps(t, E, own)[np.minimum(before, max(len(t) - 2, 0))]
+        added = added + np.where(between.reshape(w.shape), variance_beside_a_step(w, size), 0.0)
     values = np.where(exact.reshape(w.shape), E[before], (1 - w) * E[before] + w * E[after])
     influence = np.where(exact.reshape(w.shape), F[:, before], (1 - w) * F[:, before] + w * F[:, after])
     ww = w[..., None]
@@ -168,6 +180,46 @@ def intensity(t: Array, values: Array, own: Array, *, starting: bool = False, to
     if starting:
         intensity_at[0] = np.where(known[0], _starting(h[0], g[0], values[:3], variance[:3]), intensity_at[0])
     return intensity_at
+
+
+def steps(t: Array, values: Array, own: Array, *, together: bool = False) -> Array:
+    """Return the mean square S^2 of a step within each interval, (n - 1, ..., 6); 0 where nothing shows one.
+
+    S is the difference of the values less h times the mean slope of the intervals beside, if the slope of the interval
+    is outside of these two, and S more than `SIGNIFICANT` times its noise. The intervals beside a step may show half of
+    it. Parameters as of `intensity`; ``together``: the mean over all axes between the first and the last one.
+    """
+    if len(t) < 2:
+        return np.zeros((1, *values.shape[1:]))
+    h = np.diff(t).reshape(-1, *[1] * (values.ndim - 1))
+    slope = np.diff(values, axis=0) / h
+    variance = np.diagonal(own, axis1=-2, axis2=-1)
+    none = np.full((1, *slope.shape[1:]), np.nan)
+    before, after = np.concatenate([none, slope[:-1]]), np.concatenate([slope[1:], none])
+    # S = y_(k+1) - y_k - a (y_k - y_(k-1)) - b (y_(k+2) - y_(k+1))
+    a, b = (np.where(np.isfinite(each), 0.5, 0.0) for each in (before, after))
+    a[1:] *= h[1:] / h[:-1]
+    b[:-1] *= h[:-1] / h[1:]
+    before, after = (np.where(np.isfinite(each), each, 0.0) for each in (before, after))
+    size = h * (slope - (before + after) / 2)
+    limit = np.concatenate([np.e * after[:1], after[1:]])
+    outside = (slope > np.maximum(before, limit)) | (slope < np.minimum(before, limit))
+    v = np.concatenate([np.zeros_like(none), np.nan_to_num(variance), np.zeros_like(none)])
+    noise = np.square(a) * v[:-3] + np.square(1 + a) * v[1:-2] + np.square(1 + b) * v[2:-1] + np.square(b) * v[3:]
+    shown = outside & np.isfinite(size)
+    square, noise = (np.where(shown, each, 0.0) for each in (np.square(size), noise))
+    if not together:
+        return np.where(square > SIGNIFICANT**2 * noise, square, 0.0)
+    others = tuple(range(1, size.ndim - 1))
+    square, noise, count = (each.sum(axis=others, keepdims=True) for each in (square, noise, np.isfinite(size)))
+    # sums of squares of c values of noise: noise of its own size, with the relative standard deviation sqrt(2 / c)
+    limit = noise * (1 + SIGNIFICANT * np.sqrt(2 / np.maximum(count, 1)))
+    return np.where(square > limit, square, 0.0) / np.maximum(count, 1)
+
+
+def variance_beside_a_step(share: Array, square: Array) -> Array:
+    """Return the variance of the deviation from the line by a step of the mean square S^2 anywhere in the interval."""
+    return np.asarray(square * np.square(np.maximum(share, 1 - share)) / 3)
 
 
 def _starting(h: float, g: float, values: Array, variance: Array) -> Array:
