@@ -94,6 +94,8 @@ class RawSchema:
         Attributes that an imported dataset needs, and their values; no values: any text.
     asked : tuple of str
         Optional variables that a person is asked for at an import.
+    longest_interval : float
+        Interval of readings, s, beyond which the data are of another kind.
     stated : tuple of Row
         Values that a map may state in place of variables; `imported` converts them.
     derived : tuple of str
@@ -112,6 +114,7 @@ class RawSchema:
     words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     attributes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     asked: tuple[str, ...] = ()
+    longest_interval: float = float("inf")
     stated: tuple[Row, ...] = ()
     derived: tuple[str, ...] = ()
     imported: Callable[[xr.Dataset], xr.Dataset] | None = None

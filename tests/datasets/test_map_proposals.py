@@ -197,3 +197,16 @@ def test_a_file_of_no_schema_says_which_columns_it_has(tmp_path) -> None:
     proposal = propose([file_of(tmp_path, "a;b\n1;2\n2;5\n3;3\n")])
     assert not proposal.schema
     assert "'a', 'b'" in proposal.notes[0]
+
+
+def test_negative_readings_are_no_direction_of_approach(tmp_path) -> None:
+    text = MATRIX.replace("0,2", "-0,2").replace("0,4", "-0,4")
+    proposal = accepted(propose([file_of(tmp_path, text)]), X)
+    assert proposal.map["labels"] == {"target": "Target [mm]"}
+    assert proposal.map["columns"]["deviation"]["EXX"]["labels"]["run"] == [1, 1, 2, 2]
+
+
+def test_directions_may_be_signs_of_one(tmp_path) -> None:
+    text = LONG.replace(";+;", ";1;").replace(";-;", ";-1;")
+    names = accepted(propose([file_of(tmp_path, text)]), {}).map["labels"]["approach"]["names"]
+    assert names == {"1": "forward", "-1": "backward"}

@@ -13,10 +13,12 @@ from errormotion.datasets.maps.proposal import propose
 from errormotion.datasets.maps.writing import write_map
 from errormotion.errors import DatasetError
 
-FILES = 60
+FILES = 40
 """Files of each kind."""
 READ = 0.9
 """Smallest share of files that are read; the others leave something open that no answer of this test says."""
+PROPOSED = 0.5
+"""Smallest share of files whose proposed map is complete; a quarter of them state no units."""
 BEAMS = {
     "values.beam_origin": '["6 0 10 mm", "6 0 50 mm", "0 6 10 mm", "0 6 50 mm", "0 0 -1 mm"]',
     "values.beam_direction": "[[-1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, -1, 0], [0, 0, 1]]",
@@ -194,21 +196,25 @@ def thermometers(rng: random.Random, path: Path) -> tuple[dict[str, str], dict[s
     return answers, truth | {"temperature": np.stack(found, axis=1)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", [drift, positioning, lengths, thermometers])
-def test_random_files_are_read_rightly_or_asked_for(tmp_path: Path, written) -> None:
+@pytest.mark.parametrize("person", [True, False], ids=["answered", "proposals"])
+def test_random_files_are_read_rightly_or_asked_for(tmp_path: Path, written, person: bool) -> None:
+    """With the answers of a person, and with what is proposed where nothing is left open."""
     read = 0
     for seed in range(FILES):
         path, map_file = tmp_path / f"{seed}.csv", tmp_path / f"{seed}.toml"
         answers, truth = written(random.Random(seed), path)
         try:
             proposal = propose([path])
+            if not person:  # what no file says
+                answers = {key: text for key, text in answers.items() if key.startswith(("values", "attributes"))}
             while proposal.questions:
                 question = proposal.questions[0]
                 proposal = proposal.answered({question.key: answers.get(question.key, question.proposed)})
             write_map(proposal, map_file)
             raw = import_files([path], map_file)
-        except DatasetError as error:
-            print(seed, str(error).replace("\n", " ")[:200])
+        except DatasetError:
             continue
         read += 1
         for name, expected in truth.items():
@@ -222,4 +228,4 @@ def test_random_files_are_read_rightly_or_asked_for(tmp_path: Path, written) -> 
             order = ("channel", "station", "time", "run", "approach", "target", "sensor", "direction")
             found = found.transpose(*(dim for dim in order if dim in found.dims))
             np.testing.assert_allclose(found.values, expected, rtol=1e-6, atol=6e-9, err_msg=f"{seed} {name}")
-    assert read >= READ * FILES
+    assert read >= (READ if person else PROPOSED) * FILES

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from errormotion.arrays import Array
-from errormotion.datasets.maps.units import fitting_unit, orders
+from errormotion.datasets.maps.units import fitting_unit, orders, stated_unit
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.tables.dates import ELAPSED
 from errormotion.datasets.tables.mistakes import Mistakes
@@ -56,7 +56,7 @@ class Content:
     @property
     def unit(self) -> str:
         """Unit in the file; empty if none is stated."""
-        return self.table.units[self.index] if self.index < len(self.table.units) else ""
+        return stated_unit(self.table, self.index)
 
     @cached_property
     def texts(self) -> list[str]:
@@ -81,7 +81,7 @@ class Content:
 
     def may_be(self, row: Row) -> bool:
         """Return whether the stated unit, if there is one, does not contradict a variable."""
-        if not self.unit or self.unit in ("-", "1"):
+        if not self.unit:
             return True
         return bool(self.unit_for(row)) if row.unit or row.units else False
 

@@ -13,9 +13,11 @@ from errormotion.datasets.maps.columns import DATES, EMPTY, NUMBERS, TEXTS, Cont
 from errormotion.datasets.maps.form import SEQUENCE
 from errormotion.datasets.maps.words import likeness, tokens, way_of
 from errormotion.datasets.schemas import RawSchema, Row
+from errormotion.datasets.tables.dates import Clock
 from errormotion.datasets.tables.table import name_of
 from errormotion.datasets.text.layout import targets
 from errormotion.datasets.text.table_reader import FREEDOM, Names
+from errormotion.datasets.units import convert
 
 _DEVICES = ("sensor", FREEDOM)
 """Dimensions without stated labels that have a column for each label."""
@@ -23,6 +25,8 @@ _FREEDOM = re.compile(r"(?<![A-Za-z0-9])E[XYZABC][XYZABCUVW](?![A-Za-z0-9])", re
 _NUMBERING = frozenset("nr no number nummer index lfd sweep sample scan zeile row line # id count".split())  # noqa: SIM905
 _QUANTITIES = ("temperature", "speed", "pressure", "humidity", "time", "load", "feed")
 """Quantities that a title states on its own."""
+_FEW = 50
+"""Number of readings from which their interval is known."""
 _CLEAR = 2.0
 """Likeness from which a title states a variable or dimension."""
 
@@ -236,16 +240,29 @@ def _labels(schema: _Schema, found: Fit, rest: list[Content]) -> None:
             )
         ]
         if dim == "approach":
-            able = [column for column in rest if column.texts and all(map(way_of, _distinct(column)))]
-            if able:
-                names = {text: way_of(text) for text in _distinct(able[0]) if way_of(text) != text}
-                found.labels[dim] = (able[0], names)
-                rest.remove(able[0])
+            ways = next((each for each in map(_ways, rest) if each is not None), None)
+            if ways is not None:
+                found.labels[dim] = ways
+                rest.remove(ways[0])
             continue
         best = max(able, key=lambda column: likeness(column.title, dim, schema.words(dim)), default=None)
         if best is not None and likeness(best.title, dim, schema.words(dim)) >= _CLEAR:
             found.labels[dim] = (best, {})
             rest.remove(best)
+
+
+def _ways(column: Content) -> tuple[Content, dict[str, str]] | None:
+    """Return a column with directions of approach, and their names in the dataset; None for another column."""
+    texts = _distinct(column)
+    if column.kind == TEXTS:
+        names = {text: way_of(text) for text in texts}
+    elif column.kind == NUMBERS and not column.unit and likeness(column.title, "approach") >= _CLEAR:
+        names = {text: {"1": "forward", "+1": "forward", "-1": "backward"}.get(text, "") for text in texts}
+    else:
+        return None
+    if not names or not all(names.values()):
+        return None
+    return column, {text: way for text, way in names.items() if text != way}
 
 
 def _distinct(column: Content) -> list[str]:
@@ -483,6 +500,22 @@ def _complete(schema: _Schema, found: Fit) -> bool:
     return True
 
 
+def _interval(schema: _Schema, found: Fit) -> float:
+    """Return the usual interval between two readings, s; 0 if it is not known."""
+    time = next((each.column for each in found.columns if each.key == "time"), None)
+    row = next((row for row in schema.raw.rows if row.name == "time"), None)
+    if time is None or row is None:
+        return 0.0
+    if time.kind == DATES:
+        clock = Clock(time.dates[0], repeats=True)
+        values = np.array([clock.seconds(text) for text in time.texts[:_FEW] if text])
+    else:
+        unit = time.unit_for(row)
+        values = np.asarray(convert(time.values[:_FEW], unit or "s", "s"))
+    steps = np.diff(values)
+    return float(np.median(steps)) if steps.size and (time.kind == DATES or time.unit) else 0.0
+
+
 def _score(schema: _Schema, found: Fit, rest: Sequence[Content]) -> float:
     score = 0.0 if schema.raw.derived else 2.0 * len(schema.mains)  # a log may be of anything
     # as many columns as the schema has channels are no accident
@@ -494,6 +527,8 @@ def _score(schema: _Schema, found: Fit, rest: Sequence[Content]) -> float:
         score += 0.5 if each.column.kind == DATES or each.column.unit_for(row) else 0.0
     score += len(found.labels)
     score -= 1.0 * sum(column.kind == NUMBERS and not _is_number(column) for column in rest)
+    if _interval(schema, found) > schema.raw.longest_interval:
+        score -= 2.0
     score -= 0.5 * sum(column.kind == TEXTS for column in rest)
     table = sum(bool(set(schema.names.record_dims(row)) & set(schema.record)) for row in found.lacking)
     return score - 2.0 * table - 0.1 * len(found.lacking)

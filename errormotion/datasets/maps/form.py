@@ -212,6 +212,8 @@ def _components(
         return
     for label, part in parts.items():
         key = f"{name}.{label}"
+        if label == "?":
+            raise ValueError(f"columns.{key}: expected the name of the error in place of '?', such as EXX")
         if isinstance(part, dict) and "columns" in part:
             yield from _several(key, part)
         elif isinstance(part, list) and not all(map(_is_place, part)):

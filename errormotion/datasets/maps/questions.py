@@ -94,7 +94,8 @@ def questions_of(
     main = parts[0]
     found = [*_columns(main), *_attributes(main, above, answers)]
     axis = answers.get("attributes.axis") or next((q.proposed for q in found if q.key == "attributes.axis"), "")
-    found += _freedoms(parts, axis)
+    if axis or "axis" not in main.raw.attributes:  # else asked when the axis is known
+        found += _freedoms(parts, axis)
     for part in parts:
         found += [question for question in _units(part, answers) if question.key not in {each.key for each in found}]
     found += _values(main, above)

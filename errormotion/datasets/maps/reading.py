@@ -14,7 +14,7 @@ import xarray as xr
 
 from errormotion.datasets.files.tomlfile import load_model
 from errormotion.datasets.maps.form import MapFile, MapTable
-from errormotion.datasets.maps.units import fitting_unit, is_unclear, orders
+from errormotion.datasets.maps.units import fitting_unit, is_unclear, orders, stated_unit
 from errormotion.datasets.schemas import Row, variants
 from errormotion.datasets.tables.dates import is_date
 from errormotion.datasets.tables.mistakes import Mistakes
@@ -176,7 +176,7 @@ def _unit(
                 f"{' or '.join(repr(each) for each in found)}; found none",
             )
             return row.unit
-    unit = table.units[where[0]] if where[0] < len(table.units) else ""
+    unit = stated_unit(table, where[0])
     if not unit or is_unclear(unit):
         if row.unit in ("", "1") and not row.units:
             return ""
@@ -196,7 +196,7 @@ def _check_difference(key: str, entry: MappedColumn, table: Table, mistakes: Mis
         return
     before = mistakes.count
     places = [table.place(each, f"columns.{key}", mistakes) for each in (entry.column, entry.minus)]
-    own, other = (table.units[place] if place < len(table.units) else "" for place in places)
+    own, other = (stated_unit(table, place) for place in places)
     if mistakes.count == before and own != other:
         mistakes.add(0, f"columns.{key}.minus: expected a column in {own or 'no unit'}; found {other or 'no unit'}")
 

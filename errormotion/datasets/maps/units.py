@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.tables.dates import fitting
-from errormotion.datasets.tables.table import same
+from errormotion.datasets.tables.table import Table, same
 from errormotion.datasets.text.table_reader import unit_of_freedom
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
@@ -55,6 +55,12 @@ def fitting_unit(text: str, row: Row, freedom: str = "") -> str:
                 continue
             return unit
     return ""
+
+
+def stated_unit(table: Table, column: int) -> str:
+    """Return the unit of a column in its file; empty if there is none, or a dash in its place."""
+    unit = table.units[column] if column < len(table.units) else ""
+    return "" if unit in ("-", "--", "1") else unit
 
 
 def is_unclear(unit: str) -> bool:

@@ -116,5 +116,6 @@ RAW_SCHEMAS = (
         sizes=DIRECTION,
         labels=XYZ,
         attributes={"axis": ("A", "B", "C")},
+        longest_interval=0.1,  # even one turn in ten seconds has a hundred readings
     ),
 )
