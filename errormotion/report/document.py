@@ -54,6 +54,11 @@ class Text:
     kind: str = "plain"
 
 
+def noted(text: str, kind: str = "note") -> list[Block]:
+    """Return a text in place of what is missing; nothing without a text."""
+    return [Text(text, kind)] if text else []
+
+
 @dataclass(frozen=True)
 class Table:
     """A table with a head (one or two rows), a caption, and footnotes collected from its cells."""

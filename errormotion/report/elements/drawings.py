@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from errormotion.arrays import Array
 from errormotion.datasets.results.places import Scale, in_field_units, scale_of
 from errormotion.report import canvas
-from errormotion.report.document import Block, Figure, Source, Text
+from errormotion.report.document import Block, Figure, Source, noted
 from errormotion.report.drawings import maps
 from errormotion.report.elements import panels
 from errormotion.report.elements.panels import Panel
@@ -75,8 +75,8 @@ class Curves:
         found = [panels.quantities(panel, ds) for panel in self.variables or ds.em.names]
         found = [each for each in found if each]
         flat = [quantity for each in found for quantity in each]
-        if not any(np.isfinite(each.values.values.astype(float)).any() for each in flat):
-            return [Text(self.absent, "note")] if self.absent else []
+        if not any(each.known.any() for each in flat):
+            return noted(self.absent)
         dims = [str(dim) for dim in flat[0].values.dims]
         found = [[each for each in panel if set(each.values.dims) == set(dims)] for panel in found]
         found, flat = [panel for panel in found if panel], [each for panel in found for each in panel]
@@ -97,7 +97,7 @@ class Curves:
             title = panel[0].name if len(panel) == 1 else ""
             axes.set_title(f"{title} / {unit}" if columns > 2 and unit else title)
             axes.set_ylabel("" if columns > 2 else unit)
-            if not any(np.isfinite(each.values.values.astype(float)).any() for each in panel):
+            if not any(each.known.any() for each in panel):
                 panels.empty(axes)
                 return
             axes.axhline(0, color="#888888", linewidth=0.6)
@@ -172,13 +172,9 @@ class PolarPlot:
         """Return the drawing; a note or nothing without known values over the angle."""
         ds = source.errors
         found = [panels.quantities(panel, ds) for panel in self.variables or ds.em.names]
-        shown = [
-            each
-            for each in found
-            if each and each[0].values.dims == (self.over,) and np.isfinite(each[0].values.values.astype(float)).any()
-        ]
+        shown = [each for each in found if each and each[0].values.dims == (self.over,) and each[0].known.any()]
         if not shown or self.over not in ds.coords:
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         angle = np.asarray(ds[self.over].values, dtype=float)
         columns = min(self.columns, len(shown))
         tall = min((canvas.WIDTH - 0.2) / columns - 0.15, 2.7)
@@ -306,12 +302,12 @@ class Map:
         """Return the drawing; a note or nothing without known values over both dims."""
         ds = source.errors
         found = [each for panel in self.variables or ds.em.names for each in panels.quantities(panel, ds)]
-        known = any(np.isfinite(each.values.values.astype(float)).any() for each in found)
+        known = any(each.known.any() for each in found)
         if not known or min(ds.sizes.get(self.x, 0), ds.sizes.get(self.y, 0)) < 2:
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         (x, across), (y, up) = panels.sorted_along(ds, self.x), panels.sorted_along(ds, self.y)
         if (np.diff(x.values) <= 0).any() or (np.diff(y.values) <= 0).any():
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         columns = min(self.columns, len(found))
 
         def paint(axes: Axes, each: Quantity, first: bool) -> None:
@@ -341,7 +337,7 @@ class Map:
         caption = filled(self.caption, ds)
         if self.form == "contours":
             caption += " Dots: the measured values; between them the values are interpolated linearly."
-            if not all(np.isfinite(each.values.values.astype(float)).all() for each in found):
+            if not all(each.known.all() for each in found):
                 caption += " Crosses: no value; the area up to the neighbouring values is blank."
         caption += " White and the dark line: zero." if self.form == "contours" else " White: zero."
         return [Figure(svg, caption, f"Maps over {self.x} and {self.y}: {panels.stated_spans(found)}.")]

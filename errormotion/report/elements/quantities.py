@@ -64,6 +64,12 @@ class Quantity:
     unit: str
     size: float
 
+    @property
+    def known(self) -> np.ndarray:
+        """Which values are known."""
+        known: np.ndarray = np.isfinite(self.values.values.astype(float))
+        return known
+
 
 def unit_of(si: str, wanted: str = "") -> tuple[str, float]:
     """Return text and size of the unit on the page of a quantity in this SI unit; ``wanted`` is a key of `UNITS`.

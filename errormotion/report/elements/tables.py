@@ -11,7 +11,7 @@ import xarray as xr
 from errormotion.arrays import Array
 from errormotion.datasets.results.places import place_of
 from errormotion.report import document
-from errormotion.report.document import Block, Cell, Source, Text, estimate
+from errormotion.report.document import Block, Cell, Source, estimate, noted
 from errormotion.report.elements.quantities import Of, Quantity
 from errormotion.report.text import DASH, fixed, integer, percent, significant
 
@@ -183,13 +183,13 @@ class Table:
         """Return the table; a note or nothing without its variables."""
         ds = source.errors if self.of is None else self.of(source.errors)
         if ds is None:
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         over = [self.over] if isinstance(self.over, str) else list(self.over)
         read = [(column, column.read(ds)) for column in self.columns]
         read = [(column, each) for column, each in read if each is not None or not column.optional]
         columns, found = [column for column, _ in read], [each for _, each in read]
         if not any(found) or not set(over) <= set(map(str, ds.sizes)):
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         place = self.place or _name_of
         shape = [ds.sizes[dim] for dim in over]
         shown = np.ones(shape, bool)
@@ -199,7 +199,7 @@ class Table:
         rows: list[list[Cell | str]] = []
         indices = np.argwhere(shown)
         if not len(indices):
-            return [Text(self.absent, "note")] if self.absent else []
+            return noted(self.absent)
         last = None
         for index in indices[:_MOST]:
             if len(over) > 1 and shape[0] > 1 and index[0] != last:

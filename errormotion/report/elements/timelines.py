@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import xarray as xr
 
-from errormotion.report.document import Block, Figure, Source, Text
+from errormotion.report.document import Block, Figure, Source, noted
 from errormotion.report.drawings import timeline
 from errormotion.report.drawings.series import commanded_speed, events
 from errormotion.report.elements.panels import Look, Panel, look, quantities
@@ -49,7 +49,7 @@ class TimePanel:
         found = [
             each
             for each in quantities(self.variables, source.errors)
-            if each.values.dims == ("time",) and (self.empty or np.isfinite(each.values.values.astype(float)).any())
+            if each.values.dims == ("time",) and (self.empty or each.known.any())
         ]
         lines = [
             timeline.Line(
@@ -109,7 +109,7 @@ class Timeline:
                 names, errors["temperature"].transpose("time", "sensor").values.astype(float)
             )
         if not panels:
-            return [Text(self.absent, "warning")] if self.absent else []
+            return noted(self.absent, "warning")
         if self.working:
             panels += timeline.working(errors, held=self.held, commanded=commanded_speed(source) if self.held else None)
         done = events(source)

@@ -1,7 +1,9 @@
 """The chapter of the direction of a beam: comparison with nominal, planes, inclination error, check bar.
 
-It is not made of `errormotion.report.elements`: its drawings are its own, and its tables contain quantities that are
-derived from beam and planes, which as datasets for the parts would be longer than the tables.
+It is not made of `errormotion.report.elements`: half of it are drawings that exist nowhere else (the beam in space, the
+lines of the planes, the maps of the inclination error, the section of the bar), which need the arrays of `view` anyway.
+The tables of direction, zero point and bar have a few rows, each in another unit and with another uncertainty; as
+datasets for the parts they would be longer than the tables.
 """
 
 from __future__ import annotations
