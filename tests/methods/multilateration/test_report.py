@@ -213,11 +213,13 @@ def test_names_with_markup_are_escaped(html):
 
 @pytest.mark.usefixtures("undrawn")
 def test_plan_states_the_expected_uncertainty_and_no_errors(tmp_path):
-    planned = bare(target_uncertainty=(("target",), np.full(12, UM)))
+    planned = bare(target_uncertainty=(("target",), np.full(12, UM)), sigma0=((), 0.0), freedom=((), 90))
     html = page(planned, tmp_path)
+    assert "There are 90 more readings than unknowns." in html
     assert "The plan contains no better positions" in html
     assert "Expected uncertainty of a multilateration" in html
     assert "Errors of the volume" not in html
+    assert "scatter of the readings" not in html  # nothing was measured
 
 
 @pytest.mark.usefixtures("undrawn")

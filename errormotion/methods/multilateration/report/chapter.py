@@ -223,13 +223,17 @@ _UNCERTAIN = (
     KeyValue("largest uncertainty", Column(_expanded, format="2", signed=False, reduce="highest"), "U, k = 2"),
     KeyValue("readings", Column(_count, format="integer", reduce="sum"), _ignored),
 )
+_SCATTER = Sentence(
+    "The scatter of the readings is {sigma0} times the stated one; there are {freedom} more readings than unknowns.",
+    {"sigma0": _number("sigma0", _two), "freedom": _number("freedom", integer)},
+    when=lambda net: bool(net["freedom"] > 0),
+)
+_SURPLUS = Sentence(
+    "There are {freedom} more readings than unknowns.",
+    {"freedom": _number("freedom", integer)},
+    when=lambda net: bool(net["freedom"] > 0),
+)
 _CHECKED = (
-    Sentence(
-        "The scatter of the readings is {sigma0} times the stated one; there are {freedom} more readings than "
-        "unknowns.",
-        {"sigma0": _number("sigma0", _two), "freedom": _number("freedom", integer)},
-        when=lambda net: bool(net["freedom"] > 0),
-    ),
     Sentence(
         "There are as many readings as unknowns, so that there is no check.",
         when=lambda net: bool(net["freedom"] == 0),
@@ -266,6 +270,7 @@ MEASURED = Chapter(
                 Sentence("{targets}.", {"targets": _targets}),
                 Sentence("The errors of {lost} are unknown.", {"lost": _lost}),
                 Sentence("The longest error vector is ({vector}) µm.", {"vector": _vector}),
+                _SCATTER,
                 *_CHECKED,
                 Section(
                     "volume",
@@ -352,6 +357,7 @@ PLANNED = Chapter(
             (
                 *_UNCERTAIN,
                 Sentence("Planned, not measured: {targets}.", {"targets": _targets}),
+                _SURPLUS,
                 *_CHECKED,
                 Section("map", "Predicted uncertainty", plan.PARTS),
                 _UNSEEN,
