@@ -98,13 +98,13 @@ class OpenBench:
             A driver cannot be made with its settings, or does not check limits.
         """
         bench = cls(plan)
-        for each in plan.instruments:
+        for instrument in plan.instruments:
             try:
-                driver = each.driver(each.address, each.settings)
+                driver = instrument.driver(instrument.address, instrument.settings)
             except ErrormotionError as error:
-                raise BenchError(f"instrument '{each.name}': {error}", code=error.code) from error
+                raise BenchError(f"instrument '{instrument.name}': {error}", code=error.code) from error
             bench._bind(driver)
-            bench.answers.append(Answer(each, driver))
+            bench.answers.append(Answer(instrument, driver))
         return bench
 
     def open(self) -> None:

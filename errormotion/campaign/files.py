@@ -182,11 +182,15 @@ class BenchPlan:
     @property
     def settings_by_kind(self) -> dict[str, Any]:
         """Settings of the instruments by kind; of several of a kind, the first."""
-        return {each.driver.info.kind: each.settings for each in reversed(self.instruments)}
+        return {instrument.driver.info.kind: instrument.settings for instrument in reversed(self.instruments)}
 
     def chosen(self, choice: Mapping[str, str]) -> BenchPlan:
         """Return the bench with one instrument of each kind in ``choice`` (kind to name), and all of other kinds."""
-        kept = [each for each in self.instruments if choice.get(each.driver.info.kind, each.name) == each.name]
+        kept = [
+            instrument
+            for instrument in self.instruments
+            if choice.get(instrument.driver.info.kind, instrument.name) == instrument.name
+        ]
         return replace(self, instruments=tuple(kept))
 
 

@@ -93,7 +93,7 @@ def explain(a: Estimate, b: Estimate, datasets: Mapping[str, xr.Dataset], common
 
 def _pairs(common: ComparableErrors, against: str) -> list[tuple[Estimate, Estimate]]:
     estimates = common.estimates
-    if against and against not in (names := [each.name for each in estimates]):
+    if against and against not in (names := [estimate.name for estimate in estimates]):
         raise DatasetError(
             f"against: expected one of the datasets {', '.join(names)}; found '{against}'",
             code="compare.against.unknown",
@@ -103,8 +103,8 @@ def _pairs(common: ComparableErrors, against: str) -> list[tuple[Estimate, Estim
         common.notes.append(f"Pairs: '{against}' with each of the others, of {len(estimates)} datasets.")
     if not against:
         return list(combinations(estimates, 2))
-    first = next(each for each in estimates if each.name == against)
-    return [(first, each) for each in estimates if each is not first]
+    first = next(estimate for estimate in estimates if estimate.name == against)
+    return [(first, estimate) for estimate in estimates if estimate is not first]
 
 
 def _temperatures(datasets: Mapping[str, xr.Dataset], common: ComparableErrors) -> dict[str, Array]:

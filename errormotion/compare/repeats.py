@@ -198,19 +198,19 @@ def _components(w: _Square | None, b: _Square | None, h: float) -> dict[str, Arr
         apart = apart if apart > ROUNDING * b.stated else 0.0
         put(1, (b.value - w.value) / h, _difference(b, w, h), np.nan, apart / h, _larger(b))
         parts = [(b, 1 / h), (w, 1 - 1 / h)]
-        total = sum(share * each.value for each, share in parts)
-        spread = sum((share * each.value) ** 2 / each.degrees for each, share in parts)
-        stated = sum(share * each.stated for each, share in parts)
+        total = sum(share * component.value for component, share in parts)
+        spread = sum((share * component.value) ** 2 / component.degrees for component, share in parts)
+        stated = sum(share * component.stated for component, share in parts)
         degrees = total**2 / spread if spread > 0 else np.nan
         # A negative variance between groups is set to 0 (ISO 5725-2).
         put(2, max(total, w.value), _sum(parts), degrees, stated, _larger(_Square(total, degrees, stated)))
     return rows
 
 
-def _larger(each: _Square) -> float:
-    if not each.stated > 0 or not np.isfinite(each.degrees):
+def _larger(square: _Square) -> float:
+    if not square.stated > 0 or not np.isfinite(square.degrees):
         return float("nan")
-    return float(special.chdtrc(each.degrees, each.degrees * each.value / each.stated))
+    return float(special.chdtrc(square.degrees, square.degrees * square.value / square.stated))
 
 
 def _bounds(degrees: float) -> tuple[float, float]:
@@ -226,9 +226,9 @@ def _chi_square(value: float, degrees: float) -> tuple[float, float]:
 
 def _sum(parts: Sequence[tuple[_Square, float]]) -> tuple[float, float]:
     """Return the interval of a sum of mean squares with positive weights (Graybill and Wang 1980)."""
-    value = sum(share * each.value for each, share in parts)
+    value = sum(share * component.value for component, share in parts)
     G, H = (
-        np.sqrt(sum((_bounds(each.degrees)[side] * share * each.value) ** 2 for each, share in parts))
+        np.sqrt(sum((_bounds(component.degrees)[side] * share * component.value) ** 2 for component, share in parts))
         for side in (0, 1)
     )
     return value - float(G), value + float(H)
@@ -250,12 +250,12 @@ def _between_datasets(estimates: Sequence[Estimate], k: int) -> Array:
     """Return the stated covariance between datasets of one freedom at every point, (N, N, n)."""
     n = len(estimates[0].value)
     V = np.zeros((len(estimates), len(estimates), n))
-    rows = [dict(zip(each.source, each.influence[:, :, k], strict=True)) for each in estimates]
-    for i, each in enumerate(estimates):
+    rows = [dict(zip(estimate.source, estimate.influence[:, :, k], strict=True)) for estimate in estimates]
+    for i, estimate in enumerate(estimates):
         for j in range(i + 1):
             shared = rows[i].keys() & rows[j].keys()
             V[i, j] = V[j, i] = sum((rows[i][key] * rows[j][key] for key in sorted(shared)), np.zeros(n))
-        V[i, i] += each.own[:, k, k]
+        V[i, i] += estimate.own[:, k, k]
     return V
 
 

@@ -290,32 +290,32 @@ def _version(errors: xr.Dataset) -> str:
 
 def _series(readings: list[Reading]) -> Series:
     """Return readings as a series; sources of a single run are part of its uncertainty."""
-    units = {each.unit for each in readings}
+    units = {reading.unit for reading in readings}
     if len(units) > 1:
         raise RunError(
             f"The figure has several units: {', '.join(sorted(units))}. State a name of one figure only",
             code="figure.units.several",
         )
-    counts = Counter(identity for each in readings for identity, effect in each.influence.items() if effect)
+    counts = Counter(identity for reading in readings for identity, effect in reading.influence.items() if effect)
     shared = sorted(identity for identity, count in counts.items() if count > 1)
-    F = np.array([[each.influence.get(identity, 0.0) for each in readings] for identity in shared])
-    u = np.array([each.u for each in readings])
+    F = np.array([[reading.influence.get(identity, 0.0) for reading in readings] for identity in shared])
+    u = np.array([reading.u for reading in readings])
     return Series(
-        np.array([each.time for each in readings]),
-        np.array([each.value for each in readings]),
+        np.array([reading.time for reading in readings]),
+        np.array([reading.value for reading in readings]),
         np.maximum(u, np.sqrt((F**2).sum(axis=0))) if shared else u,
         F if shared else np.zeros((0, len(readings))),
         shared,
-        [each.run for each in readings],
-        [each.name for each in readings],
+        [reading.run for reading in readings],
+        [reading.name for reading in readings],
         units.pop(),
-        [each.version for each in readings],
+        [reading.version for reading in readings],
     )
 
 
 def _remarks(readings: list[Reading], at: Any) -> list[str]:
     """Return notes on differences between the runs that affect the comparison."""
-    known = [each.origin for each in readings if len(each.origin) == 4]
+    known = [reading.origin for reading in readings if len(reading.origin) == 4]
     notes = []
     for k, what in ((0, "methods"), (1, "components"), (2, "frames"), (3, "functional points (mm)")):
         values = sorted({origin[k] for origin in known})

@@ -119,14 +119,14 @@ def model_of(series: Series) -> Model:
         return Model(None)
     V = series.covariance + result.tau**2 * correlation(series.time, series.size, result.duration)
     steps, departing = list[Step](), list[int]()
-    for number, each in enumerate(chosen):
-        if each.single:
-            departing.append(each.index)
+    for number, candidate in enumerate(chosen):
+        if candidate.single:
+            departing.append(candidate.index)
             continue
         column = base.shape[1] + number
         first, last = _interval(series, base, chosen, number, V)
         size, half_width = float(result.parameters[column]), float(result.half_width[column])
-        steps.append(Step(each.index, first, last, size, half_width, each.p))
+        steps.append(Step(candidate.index, first, last, size, half_width, candidate.p))
     trend = _trend(series, base, chosen, result)
     return Model(result, tuple(sorted(steps, key=lambda step: step.index)), tuple(sorted(departing)), trend)
 
@@ -134,7 +134,7 @@ def model_of(series: Series) -> Model:
 def _trend(series: Series, base: Array, chosen: list[Candidate], result: RunFit) -> tuple[float, float, float]:
     """Return the trend with its interval, which covers that of the model without uncertain candidates."""
     fits = [result]
-    certain = [each for each in chosen if each.p <= CERTAIN]
+    certain = [candidate for candidate in chosen if candidate.p <= CERTAIN]
     if len(certain) < len(chosen) and (
         without := fit_runs(_design(base, certain), series.value, series.covariance, series.time)
     ):
@@ -153,7 +153,7 @@ def _base(series: Series) -> Array:
 
 
 def _design(base: Array, chosen: list[Candidate]) -> Array:
-    return np.column_stack([base, *(each.column(len(base)) for each in chosen)])
+    return np.column_stack([base, *(candidate.column(len(base)) for candidate in chosen)])
 
 
 def _search(series: Series, base: Array) -> list[Candidate]:
@@ -174,8 +174,8 @@ def _search(series: Series, base: Array) -> list[Candidate]:
 def _candidates(series: Series, chosen: list[Candidate], single: bool | None = None) -> list[Candidate]:
     """Return the candidates for a model; ``single`` restricts them to outliers (True) or steps (False)."""
     n, t = series.size, series.time
-    steps = [each.index for each in chosen if not each.single]
-    taken = {each.index for each in chosen if each.single}
+    steps = [candidate.index for candidate in chosen if not candidate.single]
+    taken = {candidate.index for candidate in chosen if candidate.single}
     made = []
     if single is not True:
         made += [
@@ -192,12 +192,12 @@ def _repositioned(series: Series, base: Array, chosen: list[Candidate]) -> list[
     """Return candidates at their best positions, each optimised with the others fixed, in at most five passes."""
     for _ in range(5):
         before = list(chosen)
-        for number, each in enumerate(chosen):
+        for number, candidate in enumerate(chosen):
             others = chosen[:number] + chosen[number + 1 :]
-            candidates = _candidates(series, others, each.single)
+            candidates = _candidates(series, others, candidate.single)
             trial = _Trial(series, _design(base, others), candidates) if candidates else None
             if trial is not None and trial.candidates:
-                chosen[number] = replace(trial.best(), p=each.p)
+                chosen[number] = replace(trial.best(), p=candidate.p)
         if chosen == before:
             break
     return chosen

@@ -106,8 +106,8 @@ def _obstacles(plan: CampaignPlan, test: TestPlan) -> list[str]:
             return []
     except ErrormotionError as error:
         return [str(error)]
-    movers = [each for each in bench.instruments if changes_machine(each.driver)]
-    if not movers or any(getattr(each.settings, "arm", True) for each in movers):
+    movers = [instrument for instrument in bench.instruments if changes_machine(instrument.driver)]
+    if not movers or any(getattr(instrument.settings, "arm", True) for instrument in movers):
         return []
-    names = ", ".join(f"'{each.name}'" for each in movers)
+    names = ", ".join(f"'{instrument.name}'" for instrument in movers)
     return [f"it moves the machine, and {names} only read, since arm = false; set arm = true in the bench file"]

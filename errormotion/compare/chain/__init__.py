@@ -84,8 +84,8 @@ def on_axis(
         "through the first and the last: squareness, datum and constant parts are not compared."
     )
 
-    def relative(each: PointErrors) -> PointErrors:
-        return _placed(_curve(each).relative(weights))
+    def relative(errors: PointErrors) -> PointErrors:
+        return _placed(_curve(errors).relative(weights))
 
     stored = {
         name: Stored(
@@ -107,8 +107,8 @@ def _placed(curve: Curve) -> PointErrors:
     return PointErrors(curve.value, curve.own, curve.influence, curve.source, curve.identity)
 
 
-def _curve(each: PointErrors) -> Curve:
-    return Curve(each.value, each.own, each.influence, each.source, [""] * len(each.source), each.identity)
+def _curve(errors: PointErrors) -> Curve:
+    return Curve(errors.value, errors.own, errors.influence, errors.source, [""] * len(errors.source), errors.identity)
 
 
 def _check_volume(name: str, ds: xr.Dataset, axis: str) -> None:

@@ -93,8 +93,8 @@ class Cleaned:
     def excluded(self) -> Flags:
         """All excluded readings, in the shape of the readings."""
         flags = np.zeros(self.fit.problem.readings.shape, dtype=bool)
-        for each in self.made:
-            flags |= each.readings
+        for exclusion in self.made:
+            flags |= exclusion.readings
         return flags
 
 
@@ -102,7 +102,9 @@ def notes(search: Cleaned, what: str = "readings") -> list[str]:
     """Return a sentence on what was excluded; none for valid data."""
     texts = []
     if search.made:
-        shown = [each.words + "".join(f" or {other}" for other in each.rivals) for each in search.made[:SHOWN]]
+        shown = [
+            exclusion.words + "".join(f" or {other}" for other in exclusion.rivals) for exclusion in search.made[:SHOWN]
+        ]
         more = f", and {len(search.made) - SHOWN} more" if len(search.made) > SHOWN else ""
         count = int(search.excluded.reshape(len(search.excluded), -1).any(axis=1).sum())
         done = f"{count} of them {'is' if count == 1 else 'are'} not used" if count else "their effect is estimated"
@@ -115,7 +117,7 @@ def kept(search: Cleaned, what: str = "readings") -> list[str]:
     listed = [*search.made, *search.undecided]
     if not listed:
         return []
-    words = [each.words + "".join(f" or {other}" for other in each.rivals) for each in listed[:SHOWN]]
+    words = [exclusion.words + "".join(f" or {other}" for other in exclusion.rivals) for exclusion in listed[:SHOWN]]
     more = f", and {len(listed) - SHOWN} more" if len(listed) > SHOWN else ""
     return [
         f"Some {what} contradict the others ({'; '.join(words)}{more}); they are used, since the result is that of all "
@@ -126,15 +128,15 @@ def kept(search: Cleaned, what: str = "readings") -> list[str]:
 def doubts(search: Cleaned, what: str = "readings") -> list[str]:
     """Return a sentence on each contradiction that remains, so that no uncertainty can be relied on."""
     texts = []
-    for each in search.undecided:
-        if each.rivals:
+    for exclusion in search.undecided:
+        if exclusion.rivals:
             texts.append(
-                f"One of {', '.join([each.words, *each.rivals])} is wrong, and the other {what} do not show which; "
-                "all are used. Measure them again, or add further ones."
+                f"One of {', '.join([exclusion.words, *exclusion.rivals])} is wrong, and the other {what} do not show "
+                "which; all are used. Measure them again, or add further ones."
             )
         else:
             texts.append(
-                f"The {what} indicate: {each.words}; they are used, since the others do not determine the result. "
+                f"The {what} indicate: {exclusion.words}; they are used, since the others do not determine the result. "
                 "Measure again."
             )
     return texts
@@ -252,18 +254,18 @@ class _Search:
             return None, none
         numbers = Numbers(current, self.whole)
         structures = self.structures(current)
-        trials = int(numbers.tested.sum()) + sum(each.candidate.trials for each in structures)
-        largest = max((each.gain for each in structures), default=0.0)
+        trials = int(numbers.tested.sum()) + sum(structure.candidate.trials for structure in structures)
+        largest = max((structure.gain for structure in structures), default=0.0)
         search = Sequence(current, numbers, largest, float(np.log(self.false_alarm / max(trials, 1))))
         suspects, noise = search.suspects(), search.noise
-        structures.sort(key=lambda each: noise.chance(each.gain, each.k))
+        structures.sort(key=lambda structure: noise.chance(structure.gain, structure.k))
         if structures:
             chance = noise.chance(structures[0].gain, structures[0].k)
             if chance < search.limit:
                 # What a single number explains as well is a single number: it excludes less.
                 # Its gain is that of the number alone: several numbers, each given the others, are the change itself.
-                alone = [noise.chance(float(numbers.gain[each.at]), numbers.k) for each in suspects]
-                suspects = [each for each, own in zip(suspects, alone, strict=True) if own <= chance + RIVAL / 2]
+                alone = [noise.chance(float(numbers.gain[suspect.at]), numbers.k) for suspect in suspects]
+                suspects = [suspect for suspect, own in zip(suspects, alone, strict=True) if own <= chance + RIVAL / 2]
                 if not suspects:
                     return self.structured(current, structures, chance, trials, noise.unit), none
         return self.excluded(current, suspects, trials) if suspects else (None, none)
@@ -271,34 +273,34 @@ class _Search:
     def structures(self, current: Fit) -> list[_Structure]:
         """Return the candidates with their effects."""
         listed = []
-        for each in () if self.suspects is None else self.suspects(current):
-            J = each.design[:, None, :] if each.design.ndim == 2 else each.design
+        for candidate in () if self.suspects is None else self.suspects(current):
+            J = candidate.design[:, None, :] if candidate.design.ndim == 2 else candidate.design
             rows = np.flatnonzero(J.any(axis=(1, 2)))
             white = current.linear.whitener[rows] @ J[rows]
             size, gain, rank = solved(*reduced(current, white, rows), 1e-6 * float(np.vdot(white, white)))
-            if rank and np.linalg.norm(size) >= each.smallest and each.words not in self.barred:
-                listed.append(_Structure(each, size, float(gain), int(rank)))
+            if rank and np.linalg.norm(size) >= candidate.smallest and candidate.words not in self.barred:
+                listed.append(_Structure(candidate, size, float(gain), int(rank)))
         return listed
 
     def excluded(self, current: Fit, suspects: list[Suspect], trials: int) -> tuple[Fit, Flags]:
         """Return the fit without these numbers, and those of them that are undecided."""
         wrong = np.zeros(self.problem.readings.shape, dtype=bool)
         open_ = wrong.copy()
-        for each in suspects:
-            out = self.flags(each.at)
-            for at in each.rivals:
+        for suspect in suspects:
+            out = self.flags(suspect.at)
+            for at in suspect.rivals:
                 out |= self.flags(at)
             one = Exclusion(
-                words=self.words(each.at),
-                gain=each.gain,
-                probability=_probability(each.chance, trials),
-                size=each.size,
+                words=self.words(suspect.at),
+                gain=suspect.gain,
+                probability=_probability(suspect.chance, trials),
+                size=suspect.size,
                 readings=out,
-                rivals=tuple(self.words(at) for at in each.rivals),
+                rivals=tuple(self.words(at) for at in suspect.rivals),
             )
-            if each.rivals and not self.possible(current, wrong | out):
+            if suspect.rivals and not self.possible(current, wrong | out):
                 self.undecided.append(one)
-                open_ |= self.flags(each.at)
+                open_ |= self.flags(suspect.at)
             else:
                 self.made.append(one)
                 wrong |= out

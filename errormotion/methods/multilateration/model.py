@@ -201,7 +201,7 @@ def _stated(reading: Array, sd: Array, nominal: Array, start: Stations, sources:
     n, m = reading.shape
     station, every = np.repeat(np.arange(n), m), np.zeros(n * m, dtype=np.intp)
     c, has_drift = _by_station(sources.drift, n, m)
-    g = np.array([np.nan_to_num(each.change).ravel() for each in sources.scales]).reshape(-1, n * m).T
+    g = np.array([np.nan_to_num(scale.change).ravel() for scale in sources.scales]).reshape(-1, n * m).T
 
     def equation(y: Array, x: Unknowns[Array], known: Known[Array]) -> Array:
         length = y * (1.0 + known.air[:, 0] + known.tracker[:, 0]) + np.einsum("ns,ns->n", g, known.scales)
@@ -240,8 +240,8 @@ def _stated(reading: Array, sd: Array, nominal: Array, start: Stations, sources:
                 index=every,
                 scale=LINEAR,
                 group=SCALES,
-                names=[each.name for each in sources.scales],
-                identity=[sources.identity.get(each.name, "") for each in sources.scales],
+                names=[scale.name for scale in sources.scales],
+                identity=[sources.identity.get(scale.name, "") for scale in sources.scales],
             ),
         ),
         noise=Noise(sd=sd.ravel(), freedom=freedom),

@@ -270,14 +270,14 @@ class _Finish:
 
     def _refuse_moves(self, solved: Solved) -> None:
         """Raise MethodError if the readings are explained by a station that was moved between them."""
-        for each in () if solved.cleaned is None else (*solved.cleaned.made, *solved.cleaned.undecided):
-            if " moved before target " in each.words:
-                name, target = each.words.removeprefix("station ").split(" moved before target ")
+        for exclusion in () if solved.cleaned is None else (*solved.cleaned.made, *solved.cleaned.undecided):
+            if " moved before target " in exclusion.words:
+                name, target = exclusion.words.removeprefix("station ").split(" moved before target ")
                 raise MethodError(
                     f"Expected every station at rest; station {name} was moved by about "
-                    f"{float(np.linalg.norm(each.size[:3])) * 1e3:.3g} mm before target {target}. Measure this set-up "
-                    "again, or state its readings from this target on as a separate station. A drifting set-up has the "
-                    "same effect: measure some of its targets twice.",
+                    f"{float(np.linalg.norm(exclusion.size[:3])) * 1e3:.3g} mm before target {target}. Measure this "
+                    "set-up again, or state its readings from this target on as a separate station. A drifting set-up has "
+                    "the same effect: measure some of its targets twice.",
                     code="network.station.moved",
                 )
 
@@ -316,8 +316,8 @@ class _Finish:
     def _left_out(self, solved: Solved) -> NDArray[np.int8]:
         """Return for each reading (n, m): 0 = used, 1 = wrong, 2 = one of several of which one is wrong."""
         excluded = self.wrong.astype(np.int8)
-        for each in () if solved.cleaned is None else solved.cleaned.made:
-            excluded[each.readings.reshape(excluded.shape)] = 2 if each.rivals else 1
+        for exclusion in () if solved.cleaned is None else solved.cleaned.made:
+            excluded[exclusion.readings.reshape(excluded.shape)] = 2 if exclusion.rivals else 1
         return excluded
 
     def _extras(

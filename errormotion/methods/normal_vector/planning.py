@@ -57,12 +57,12 @@ def expected(settings: NormalVectorSettings) -> xr.Dataset:
     normal = touching.normals(settings)
     touch = centre[:, None] + (radius + tip)[:, None, None] * normal
     time = settings.interval * np.arange(count)
-    each = ("time", "ball", "touch")
+    dims = ("time", "ball", "touch")
     return xr.Dataset(
         {
-            "touch": ((*each, "direction"), np.tile(touch, (count, 1, 1, 1)), _M),
-            "touch_time": (each, np.tile(time[:, None, None], (1, *touch.shape[:2])), _S),
-            "approach": ((*each[1:], "direction"), -normal, {"units": "1"}),
+            "touch": ((*dims, "direction"), np.tile(touch, (count, 1, 1, 1)), _M),
+            "touch_time": (dims, np.tile(time[:, None, None], (1, *touch.shape[:2])), _S),
+            "approach": ((*dims[1:], "direction"), -normal, {"units": "1"}),
             "tip_radius": ((), tip, _M),
             "ball_radius": ("ball", radius, _M),
             "ball_nominal": (("ball", "direction"), centre, _M),

@@ -66,11 +66,11 @@ class Excluded:
         moves = []
         made = () if solved.cleaned is None else solved.cleaned.made
         names = {probing.moved(ball, cycle): (ball, cycle) for ball in range(b) for cycle in range(k)} if made else {}
-        for each in made:
-            if each.words in names:
-                moves.append((each, *names[each.words]))
+        for exclusion in made:
+            if exclusion.words in names:
+                moves.append((exclusion, *names[exclusion.words]))
             else:
-                wrong |= each.readings.any(axis=1).reshape(k, b, -1)
+                wrong |= exclusion.readings.any(axis=1).reshape(k, b, -1)
         lost = np.flatnonzero(~probing.usable(solved.fit.problem))
         return cls(wrong, moves, lost)
 
@@ -88,7 +88,7 @@ def identified(method: ModelMethod, raw: xr.Dataset, settings: NormalVectorSetti
     if settings.procedure == "normals":
         steps = ["normals of two planes through four balls, Cayley"]
     if solved.cleaned is not None:
-        steps += [f"excluded: {each.words}" for each in solved.cleaned.made]
+        steps += [f"excluded: {exclusion.words}" for exclusion in solved.cleaned.made]
     errors = dataset(method, solved, raw, method.info, provenance.make(settings, raw, None, steps=steps))
     for note in errors.em.notes:
         log.warning(note)

@@ -263,11 +263,11 @@ def _touches(
     lost = rng.uniform(size=cycles.shape) < cycles.missing
     flag = np.where(lost | np.isnan(contacts).any(axis=-1), 1, 0)  # no trip
     approach = np.broadcast_to(-cycles.normals, (cycles.balls, *cycles.normals.shape))
-    each = ("time", "ball", "touch")
+    dims = ("time", "ball", "touch")
     return {
-        "touch": ((*each, "direction"), np.where(flag[..., None] == 0, contacts, np.nan), _M),
-        "touch_time": (each, cycles.touch_times, _S),
-        "touch_flag": (each, flag.astype(np.int64), {"units": "1"}),
+        "touch": ((*dims, "direction"), np.where(flag[..., None] == 0, contacts, np.nan), _M),
+        "touch_time": (dims, cycles.touch_times, _S),
+        "touch_flag": (dims, flag.astype(np.int64), {"units": "1"}),
         "approach": (("ball", "touch", "direction"), approach.copy(), {"units": "1"}),
         "tip_radius": ((), probe.nominal_tip_radius, _M),
         "ball_radius": ("ball", np.full(cycles.balls, balls.nominal_radius), _M),

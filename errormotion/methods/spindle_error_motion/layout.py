@@ -203,8 +203,8 @@ class Layout:
         for i, j in ((first, second), (first + 3, second + 3)):
             one = self.determined[[i, j]]
             for along, across in ((cos, sin), (-sin, cos)):  # a vector that turns with the spindle
-                each = np.zeros((angle.size, 6))
-                each[:, i], each[:, j] = (along, across) if one.all() else (along * one[0], along * one[1])
+                motion = np.zeros((angle.size, 6))
+                motion[:, i], motion[:, j] = (along, across) if one.all() else (along * one[0], along * one[1])
                 if one.any():
-                    columns.append(each)
+                    columns.append(motion)
         return np.array(columns).reshape(-1, angle.size, 6)

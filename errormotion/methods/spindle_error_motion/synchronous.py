@@ -231,8 +231,8 @@ def _with_rounding(synchronous: Synchronous, step: Array, noise: float, turns: i
     scatter = synchronous.coefficient[:, 1:].var(axis=0, ddof=1).sum(axis=0) / 2 * turns / batches
     before = np.hypot(noise, np.sqrt(scatter))
     alike = np.array([float(common(float(q), s)) for q, s in zip(step, before, strict=True)])
-    each = max(synchronous.count / turns, 1.0)  # samples in a turn
-    rounded = alike * np.sqrt(np.minimum((2 * synchronous.harmonics + 1) / each, 1.0))
+    samples_per_turn = max(synchronous.count / turns, 1.0)  # samples in a turn
+    rounded = alike * np.sqrt(np.minimum((2 * synchronous.harmonics + 1) / samples_per_turn, 1.0))
     notes = list(synchronous.notes)
     if (alike > 0.1 * step).any():
         words = ", ".join(f"sensor {i + 1} by {1e9 * q:.3g} nm" for i, q in enumerate(step) if q > 0)

@@ -271,8 +271,8 @@ def _phasors(raw: xr.Dataset, radial: NDArray[np.intp], frequency: float) -> tup
         time, y = np.append(kept_time, chunk.time), np.concatenate([kept, chunk.reading[radial]], axis=1)
         n = max(int(_TURNS_OF_A_BLOCK / frequency / np.median(np.diff(time[:1000]))), 8)
         for first in range(0, time.size - n + 1, n):
-            t, each = time[first : first + n], y[:, first : first + n]
-            its = np.isfinite(each).all(axis=0)
+            t, readings = time[first : first + n], y[:, first : first + n]
+            its = np.isfinite(readings).all(axis=0)
             middle = float(t.mean())
             times.append(middle)
             if its.sum() < 8:
@@ -281,10 +281,10 @@ def _phasors(raw: xr.Dataset, radial: NDArray[np.intp], frequency: float) -> tup
                 continue
             phase = TAU * frequency * (t[its] - middle)
             design = np.stack([np.ones(phase.size), phase, np.cos(phase), np.sin(phase)], axis=1)
-            a, *_ = np.linalg.lstsq(design, each[:, its].T, rcond=None)
+            a, *_ = np.linalg.lstsq(design, readings[:, its].T, rcond=None)
             # cos(phase + p) = cos p cos phase - sin p sin phase
             phasors.append(a[2] - 1j * a[3])
-            rest.append(np.mean(np.square(each[:, its].T - design @ a), axis=0))
+            rest.append(np.mean(np.square(readings[:, its].T - design @ a), axis=0))
         done = time.size // n * n
         kept_time, kept = time[done:], y[:, done:]
     return np.array(times), np.array(phasors).reshape(-1, radial.size), np.array(rest).reshape(-1, radial.size)

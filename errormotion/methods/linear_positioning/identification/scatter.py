@@ -281,13 +281,13 @@ def _own(estimate: Components, shape: tuple[int, ...], kind: str) -> tuple[Array
         freedom *= float(of_approach.min() / of_approach.sum())
     if kind == "pooled" or (kind == "auto" and not _differ(square / common, redundancy)):
         return common, freedom, True, False
-    each = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), common)
-    each = np.maximum(each, SMALLEST * pooled)
+    variance = np.where(redundancy > 0.5, square / np.maximum(redundancy, 0.5), common)
+    variance = np.maximum(variance, SMALLEST * pooled)
     of_each = float(np.median(redundancy[redundancy > 0.5]))
     if of_each > 2:
-        return each, of_each, False, False
+        return variance, of_each, False, False
     if kind == "auto":
-        return np.maximum(each, common), freedom, False, True
+        return np.maximum(variance, common), freedom, False, True
     least = int(np.ceil(2.0 * shape[1] / of_each)) + 1
     raise MethodError(
         f"Variances by target: expected {least} runs or more at these targets; found {shape[1]}. Use scatter 'pooled'.",

@@ -122,7 +122,7 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
     used = np.ones(len(points), dtype=bool)
     while True:
         candidates = _candidates(points[used], contact, settings.highest)
-        best = min(candidates, key=lambda each: each.cross_validated)
+        best = min(candidates, key=lambda candidate: candidate.cross_validated)
         worst = _worst(best.left_out_residual)
         if worst is None or used.sum() <= math.ceil((1 - _MAX_OUTLIERS) * len(points)):
             break
@@ -144,8 +144,8 @@ def fit_pretravel(touch: ArrayLike, settings: PretravelSettings) -> PretravelMap
             "left_out": (~used).astype(int),
             "reach": _widest_gap(normals[used]),
             "noise": noise,
-            "cross_validated": [each.cross_validated for each in candidates],
-            "highest": [each.highest for each in candidates],
+            "cross_validated": [candidate.cross_validated for candidate in candidates],
+            "highest": [candidate.highest for candidate in candidates],
             "ball_radius": settings.ball_radius,
             "tip_radius": settings.tip_radius,
         },

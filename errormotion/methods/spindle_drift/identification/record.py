@@ -401,21 +401,23 @@ def run_out_left(
         if not part.size or not turning[part].any() or round(usual) in said:
             continue
         said.add(round(usual))
-        for each in aliases(usual / 60.0, rate, count):
+        for alias in aliases(usual / 60.0, rate, count):
             what = (
                 f"At {usual:.0f} 1/min and {rate:.4g} samples per second, a mean over {settings.average:g} s contains"
             )
-            order = f"the run-out (harmonic {each.order})"
-            if each.frequency * settings.average < 1.0:
-                period = f"a wave with a period of about {1 / each.frequency:.2g} s" if each.frequency else "an offset"
+            order = f"the run-out (harmonic {alias.order})"
+            if alias.frequency * settings.average < 1.0:
+                period = (
+                    f"a wave with a period of about {1 / alias.frequency:.2g} s" if alias.frequency else "an offset"
+                )
                 doubts.append(
-                    f"{what} {100 * each.share:.0f} % of {order} as {period}, which the uncertainty does not contain. "
+                    f"{what} {100 * alias.share:.0f} % of {order} as {period}, which the uncertainty does not contain. "
                     "Choose another spindle speed, sample rate or average."
                 )
             elif record.scatter is not None:
-                size = each.share * np.sqrt(np.maximum(record.scatter**2 - stated**2, 0.0))
+                size = alias.share * np.sqrt(np.maximum(record.scatter**2 - stated**2, 0.0))
                 if (size > stated / np.sqrt(count)).any():
-                    notes.append(f"{what} {100 * each.share:.0f} % of {order}; the uncertainty contains it.")
+                    notes.append(f"{what} {100 * alias.share:.0f} % of {order}; the uncertainty contains it.")
                     run_out = np.maximum(run_out, size)
     return run_out
 
