@@ -68,7 +68,7 @@ def test_an_idle_device_is_started_and_an_aligned_one_is_unchanged() -> None:
         AttocubeIds("sim://cframe/ids?seed=3&aligning=1", ONE).open()
     with raises("interferometer.not_started"):
         AttocubeIds("sim://cframe/ids?seed=3&contrast=50", ONE).open()
-    with pytest.raises(InstrumentTimeoutError, match="measurement starting"):
+    with raises("instrument.no_answer"):
         AttocubeIds("sim://cframe/ids?seed=3&init=9", ONE.model_copy(update={"start_timeout": 0.2})).open()
 
 

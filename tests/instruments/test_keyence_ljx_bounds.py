@@ -4,7 +4,7 @@ import time
 import tracemalloc
 
 import numpy as np
-import pytest
+from coded import raises
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -96,7 +96,7 @@ def test_replies_and_requests_raise_only_protocol_errors(data: bytes) -> None:
 def test_a_reply_whose_two_lengths_disagree_is_refused() -> None:
     frame = bytearray(codec.reply(bytes(4), command=0x37))
     frame[codec.BODY_LENGTH] += 1
-    with pytest.raises(ProtocolError, match=r"has a body of 16; found the length 17 at byte 12"):
+    with raises("protocol.reply.length"):
         codec.parse_reply(bytes(frame))
 
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from coded import raises
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -104,7 +105,7 @@ def test_garbage_is_neither_a_request_nor_a_reply(data: bytes) -> None:
 
 
 def test_a_reply_that_is_too_short_for_the_request_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="Expected a reply with 6 bytes of data; found 4"):
+    with raises("protocol.reply.length"):
         codec.parse_reply(codec.reply(bytes(4))).unpack("3h")
 
 

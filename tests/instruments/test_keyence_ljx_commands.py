@@ -72,7 +72,7 @@ def test_a_late_reply_is_not_taken_for_the_next_one(controller: Controller) -> N
     held: list[bytes] = []
     number = len(controller.requests)
     controller.otherwise[number] = held.append
-    with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+    with raises("instrument.no_answer"):
         profiler.counts()
     controller.otherwise[number + 1] = lambda reply: [controller.commands.send(part) for part in (*held, reply)]
     assert profiler.counts().trigger == number + 2  # its own request; number + 1 was the one that synchronises
@@ -91,7 +91,7 @@ def test_a_reply_that_breaks_off_is_completed_later(controller: Controller) -> N
         rest.append(reply[10:])
 
     controller.otherwise[number] = half
-    with pytest.raises(InstrumentTimeoutError, match=r"expected 40 bytes within 0\.3 s; received 6"):
+    with raises("instrument.no_answer"):
         profiler.counts()
     controller.otherwise[number + 1] = lambda reply: [controller.commands.send(part) for part in (*rest, reply)]
     assert profiler.counts().trigger == number + 2
@@ -129,7 +129,7 @@ def test_a_device_that_stays_silent_gives_typed_errors_until_it_answers(controll
     for i in range(4):
         controller.otherwise[number + i] = lambda reply: None
     for _ in range(3):  # the command; another one and the start of a session; the start of the next session
-        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+        with raises("instrument.no_answer"):
             profiler.counts()
     assert profiler.counts().trigger == len(controller.requests) - 1
     profiler.close()

@@ -281,9 +281,9 @@ def test_silence_of_a_profiler_at_the_trigger_gives_timeouts(
     with KeyenceLJX(reach(ramp), FAST) as profiler:
         ramp.fault = parse_fault(parse_address("sim://cframe/p?fault=silence&fault_at=9"), ramp.faults)
         monkeypatch.setattr(ramp._feed, "trigger", lambda: setattr(ramp, "_mute", True))
-        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+        with raises("instrument.no_answer"):
             profiler.read()
-        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+        with raises("instrument.no_answer"):
             profiler.program()
         ramp._mute = False
         assert profiler.program() == 0  # over a new connection
@@ -414,7 +414,7 @@ def test_checksums_that_are_always_wrong_end_in_a_protocol_error() -> None:
 
 def test_silence_from_the_start_is_a_timeout_error_when_opening() -> None:
     start = time.monotonic()
-    with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+    with raises("instrument.no_answer"):
         session(SMALL + "&fault=silence", settings=FAST)
     assert time.monotonic() - start < 30.0
 
@@ -422,9 +422,9 @@ def test_silence_from_the_start_is_a_timeout_error_when_opening() -> None:
 def test_silence_in_a_stream_is_a_timeout_error_and_so_are_commands_until_it_answers_again() -> None:
     profiler = KeyenceLJX(SMALL + "&fault=silence&fault_at=50", FAST)
     with profiler:
-        with pytest.raises(InstrumentTimeoutError, match=r"no data for 0\.5 s"):
+        with raises("instrument.no_answer"):
             take(profiler, 3, 40)
-        with pytest.raises(InstrumentTimeoutError, match="expected 4 bytes"):
+        with raises("instrument.no_answer"):
             profiler.identify()
     with profiler:
         assert profiler.identify().manufacturer == "Keyence"
@@ -438,7 +438,7 @@ def test_a_start_that_is_answered_late_is_answered_before_the_stream_breaks(monk
         at_once(simulator, data)
 
     monkeypatch.setattr(SimulatedLJX, "reply", late)
-    with pytest.raises(InstrumentTimeoutError, match=r"no data for 0\.5 s"):
+    with raises("instrument.no_answer"):
         session(SMALL + "&fault=silence&fault_at=50", settings=FAST)
 
 
@@ -506,7 +506,7 @@ def test_another_device_at_the_address_is_a_typed_error(answer: bytes, error: ty
 def test_a_stream_port_without_a_server_is_named(ramp: SimulatedLJX) -> None:
     with raises("connection.not_opened"):
         KeyenceLJX(f"{ramp.url}?stream=9").open()
-    with pytest.raises(InstrumentError, match=r"'stream' in .* expected a port from 1 to 65535; found 70000"):
+    with raises("address.number"):
         KeyenceLJX(f"{ramp.url}?stream=70000").open()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from armed import CONTROLLER
+from coded import raises
 
 from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
 from errormotion.instruments.controller.mtconnect import MTConnect, MTConnectSettings
@@ -217,7 +218,7 @@ def test_splitting_has_no_effect() -> None:
 
 
 def test_a_document_that_is_too_large_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="larger than 1024 bytes"):
+    with raises("protocol.reply.too_long"):
         MTConnect(ADDRESS, MTConnectSettings(most_bytes=1024)).open()
 
 

@@ -167,7 +167,7 @@ def test_numbers_round_trip_in_si(values: list[float]) -> None:
 
 @pytest.mark.parametrize("text", ["two", "1,5", "0x10"])
 def test_a_value_that_is_no_number_is_an_error(text: str) -> None:
-    with pytest.raises(ProtocolError, match="'p': expected a number"):
+    with raises("protocol.mtconnect.number"):
         Observation("p", 1, 0.0, text).number()
 
 

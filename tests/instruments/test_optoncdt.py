@@ -179,7 +179,7 @@ def test_a_beam_that_the_machine_does_not_have_is_refused() -> None:
 
 def test_silence_from_the_start_is_a_timeout_error() -> None:
     settings = OptoSettings(rate=1500.0, timeout=0.2)
-    with pytest.raises(InstrumentTimeoutError, match="received nothing"):
+    with raises("instrument.no_answer"):
         OptoNCDT("sim://cframe/X1?seed=3&fault=silence", settings).open()
 
 
@@ -190,7 +190,7 @@ def test_silence_in_a_stream_is_a_timeout_error_after_the_samples_before_it() ->
         OptoNCDT(
             "sim://cframe/X1?seed=3&fault=silence&fault_at=5001", settings
         ) as sensor,  # one more confirms the last
-        pytest.raises(InstrumentTimeoutError, match=r"no data for 0\.2 s"),
+        raises("instrument.no_answer"),
     ):
         got.extend(sensor.stream(block=1000))
     assert len(got) == 5

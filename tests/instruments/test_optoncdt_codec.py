@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from optoncdt_by_the_manual import Sensor
 from wire_vectors import Vector, vectors
 
-from errormotion.errors import InstrumentError, ProtocolError
+from errormotion.errors import InstrumentError
 from errormotion.instruments.point_lds.optoncdt import codec, commands, kernels
 from errormotion.instruments.point_lds.optoncdt.decoder import StreamDecoder
 from errormotion.instruments.point_lds.optoncdt.models import MODELS
@@ -299,7 +299,7 @@ def test_any_answer_of_the_sensor_is_an_answer_or_an_error_of_the_project(text: 
 
 
 def test_an_answer_that_is_too_long_is_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match=f"{commands.MAX_ANSWER} at most"):
+    with raises("protocol.reply.too_long"):
         commands.parse_answer("PRINT", b"x" * (commands.MAX_ANSWER + 1))
 
 

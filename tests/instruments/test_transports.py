@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from coded import raises
 
-from errormotion.errors import InstrumentError, InstrumentTimeoutError, ProtocolError
+from errormotion.errors import InstrumentError, InstrumentTimeoutError
 from errormotion.instruments.transports import Transport, open_transport, parse_address, serial_line
 from errormotion.instruments.transports.base import LINE_ENDS
 from errormotion.instruments.transports.half_duplex import HalfDuplexTransport
@@ -108,7 +108,7 @@ def test_a_number_of_bytes_is_read_whatever_the_pieces(line: Transport) -> None:
 
 def test_an_endless_line_becomes_a_protocol_error(line: Transport) -> None:
     line.write(b"x" * 100)
-    with pytest.raises(ProtocolError, match="bytes without b';'"):
+    with raises("protocol.reply.too_long"):
         line.read_until(b";", limit=10)
 
 
