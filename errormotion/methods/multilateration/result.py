@@ -276,8 +276,8 @@ class _Finish:
                 raise MethodError(
                     f"Expected every station at rest; station {name} was moved by about "
                     f"{float(np.linalg.norm(exclusion.size[:3])) * 1e3:.3g} mm before target {target}. Measure "
-                    "this set-up again, or state its readings from this target on as a separate station. A drifting set-up "
-                    "has the same effect: measure some of its targets twice.",
+                    "this set-up again, or state its readings from this target on as a separate station. A drifting "
+                    "set-up has the same effect: measure some of its targets twice.",
                     code="network.station.moved",
                 )
 
