@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import xarray as xr
+from pydantic import BaseModel
 
 from errormotion.errors import PluginWarning
 from errormotion.plugins.contracts import (
@@ -48,6 +49,12 @@ class Owner:
     """Formats of maps for ``errormotion import``: value of the key ``schema`` of a map to a function ``(log, map)``.
 
     The function returns the raw dataset. A map whose key ``schema`` is a raw schema needs none.
+    """
+
+    log_maps: ClassVar[Mapping[str, type[BaseModel]]] = _NONE
+    """Ending of a file, such as ``.rtl``, to the model of its map, for formats that a reader of `log_readers` reads.
+
+    ``errormotion add`` asks for the required fields of the model, and writes the map.
     """
 
     def texts(self, language: str) -> Mapping[str, str]:  # noqa: ARG002

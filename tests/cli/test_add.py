@@ -249,3 +249,29 @@ def test_tolerances_decide_on_an_imported_run(run: Run, tmp_path: Path) -> None:
     (tmp_path / "limits.toml").write_text(limits)
     run("add", "a.csv", "--tolerances", "limits.toml", *FAST, code=4)
     assert single(tmp_path / "runs").data["conformity"]["verdict"] in run("runs").stdout
+
+
+def test_a_file_with_a_map_of_its_own_is_asked_for_what_it_does_not_state(run: Run, tmp_path: Path) -> None:
+    targets = [0.0, 10.5, 20.25, 30.0, 41.0, 50.0]
+    head = f"HEADER::\nOwner : Linear\n\nTARGET DATA::\nTarget-count: 6\nTargets :\n{' '.join(map(str, targets))}\n\n"
+    lines = [head + "USER-TEXT::\nMachine: Mill 7\n\nRUNS::\nRun-count:8\n\nDEVIATIONS::\nRun Target Data:"]
+    rng = np.random.default_rng(1)
+    for number in range(8):
+        order = range(6) if number % 2 == 0 else range(5, -1, -1)
+        lines += [f"{number + 1} {k + 1} {0.1 * targets[k] + rng.normal(0, 0.3):.2f}" for k in order]
+    (tmp_path / "Y.rtl").write_text("\n".join([*lines, "EOF::"]) + "\n")
+    assert "--axis AXIS" in run("add", "Y.rtl", "--yes", code=1).stderr
+    assert "map.axes: no such question" in run("add", "Y.rtl", "--axis", "Y", "--set", "map.axes=X", code=1).stderr
+    assert list((tmp_path / "runs").iterdir()) == []
+    run("add", "Y.rtl", "--axis", "Y", "--set", "map.length_uncertainty=0.4 um/m", *FAST)
+    folder = single(tmp_path / "runs")
+    assert (folder.data["test"], folder.data["bench"]["machine"]) == ("linear_positioning-Y", "Mill 7")
+    with datasets.load(folder.raw) as raw:
+        assert float(raw["length_uncertainty"]) == pytest.approx(0.4e-6)
+
+
+def test_errors_name_the_added_file_and_not_its_copy(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.nc").write_bytes(b"no dataset")
+    message = run("add", "a.nc", code=1).stderr
+    assert message.startswith("a.nc: ")
+    assert "runs" not in message

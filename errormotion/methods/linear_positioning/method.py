@@ -66,6 +66,7 @@ class LinearPositioning(ModelMethod):
     texts = lazy("errormotion.methods.linear_positioning.report:texts")
     conformance = lazy("errormotion.methods.linear_positioning.conformance:subjects")
     log_readers = lazy("errormotion.methods.linear_positioning.rtl:LOG_READERS")
+    log_maps = lazy("errormotion.methods.linear_positioning.rtl:LOG_MAPS")
     figures = lazy("errormotion.methods.linear_positioning.figures:figures")
 
     def acquire(

@@ -139,6 +139,8 @@ def _check_owner(log: Path, owner: str, stated: RtlMap, freedom: str) -> None:
 
 
 LOG_READERS = {MAP_SCHEMA: read_rtl}
+LOG_MAPS = {".rtl": RtlMap}
+"""Model of the map by the ending of a file."""
 """Readers by the schema of their map."""
 
 Lines = list[tuple[int, str]]

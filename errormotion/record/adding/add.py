@@ -30,7 +30,7 @@ from errormotion.errors import DatasetError, RunError, code_of
 from errormotion.plugins import Method
 from errormotion.record.adding.machines import remember
 from errormotion.record.adding.mapping import MapOfFiles, map_of_files, of_machine
-from errormotion.record.adding.originals import KEPT, Original, keep, originals_of, run_of
+from errormotion.record.adding.originals import KEPT, MAP, Original, keep, originals_of, run_of
 from errormotion.record.adding.questions import Ask
 from errormotion.record.adding.reading import owner_of, read_raw
 from errormotion.record.adding.request import Request
@@ -86,7 +86,7 @@ def add(
         to continue.
     """
     originals = originals_of(request.files)
-    before = None if request.again else run_of(originals.values(), request.runs)
+    before = None if request.again else run_of(originals.values(), request.record)
     if before is not None and before.finished:
         return Added(before, known=True)
     work = _Adding(request, originals, ask, stage)
@@ -132,7 +132,7 @@ class _Adding:
         self.stage("copying the files")
         copies = keep(self.originals, folder)
         self.stage("reading the files")
-        with _about(self.request.files):
+        with _about(self.request.files, folder):
             self.map = map_of_files(self.request, copies, folder, self.ask)
             raw = read_raw(copies, self.map.file)
             self.owner = owner_of(raw)
@@ -166,7 +166,7 @@ class _Adding:
             )
         found["machine"] = known or request.machine or stated
         if not found["machine"]:
-            question = of_machine(Question("machine", "", (), "", True), request.runs)
+            question = of_machine(Question("machine", "", (), "", True), request.record.machines)
             found["machine"] = self.ask([question])["machine"]
         if request.axis:
             axis = str(raw.attrs.get("axis", request.axis))
@@ -247,13 +247,16 @@ def _start(raw: xr.Dataset, files: Sequence[Path]) -> tuple[str, str]:
 
 
 @contextmanager
-def _about(files: Sequence[Path]) -> Iterator[None]:
-    """Name the file in errors that do not."""
+def _about(files: Sequence[Path], folder: Path) -> Iterator[None]:
+    """Name the files in errors, instead of their copies in a folder."""
     try:
         yield
     except DatasetError as error:
-        if not str(error).startswith("--") and files[0].name not in str(error):
-            error.args = (f"{files[0]}: {error}",)
+        text = str(error)
+        for path in files:
+            text = text.replace(str(folder / KEPT / path.name), str(path))
+        text = text.replace(str(folder / MAP), "the map")
+        error.args = (text if text.startswith("--") or files[0].name in text else f"{files[0]}: {text}",)
         raise
 
 

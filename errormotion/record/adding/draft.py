@@ -12,7 +12,9 @@ from errormotion.datasets.maps.proposal import Preview, Question, propose
 from errormotion.errors import DatasetError
 from errormotion.record.adding.machines import load_machines
 from errormotion.record.adding.mapping import of_machine
+from errormotion.record.adding.own_maps import own_map, questions_of
 from errormotion.record.adding.reading import is_raw, owner_of, read_raw
+from errormotion.record.adding.request import Request
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,16 @@ def draft_of(paths: Sequence[Path], runs: Path, answers: Mapping[str, str]) -> D
     DatasetError
         A file cannot be read, or an answer is wrong (``map.answer``).
     """
+    machines = Request(tuple(paths), runs).record.machines
     if all(is_raw(path) for path in paths):
         with read_raw(paths, None) as raw:
             owner, machine = owner_of(raw), str(raw.attrs.get("machine", "")).replace("unknown", "")
-        asked = [] if machine or "machine" in answers else [of_machine(Question("machine", "", (), "", True), runs)]
+        asked = [] if machine or "machine" in answers else [of_machine(Question("machine", "", (), "", True), machines)]
         return Draft(owner.info.summary, (), tuple(asked), ())
+    if (model := own_map(paths)) is not None:
+        asked = questions_of(model, answers)
+        asked += [] if "machine" in answers else [of_machine(Question("machine", "", (), "", needed=True), machines)]
+        return Draft(f"a file {paths[0].suffix.lower()}", (), tuple(asked), ())
     found = propose(paths)
     if not found.questions and not found.schema:
         raise DatasetError(found.notes[0], code="add.file.unknown")
@@ -67,7 +74,7 @@ def draft_of(paths: Sequence[Path], runs: Path, answers: Mapping[str, str]) -> D
     machine = str(found.map.get("machine", ""))
     known = load_machines(runs).answers(machine, found.schema)
     questions = tuple(
-        of_machine(each, runs)
+        of_machine(each, machines)
         if each.key == "machine"
         else Question(each.key, each.text, each.choices, known.get(each.key, each.proposed), each.needed)
         for each in found.questions

@@ -20,10 +20,11 @@ from errormotion.datasets.schemas import RawSchema
 from errormotion.errors import DatasetError
 from errormotion.record.adding.machines import load_machines
 from errormotion.record.adding.originals import MAP
+from errormotion.record.adding.own_maps import own_map, questions_of, write_own_map
 from errormotion.record.adding.questions import Ask
 from errormotion.record.adding.reading import is_raw
 from errormotion.record.adding.request import Request
-from errormotion.record.runs.listing import list_runs
+from errormotion.record.runs.listing import Listing
 
 MAX_MAPS = 200
 """Largest number of maps of earlier runs that are tried."""
@@ -67,45 +68,50 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
         return MapOfFiles()
     if map_file.is_file() and not leaves(folder, map_file) and not request.answers:
         return MapOfFiles(map_file)
-    schemas: Sequence[RawSchema] = plugins.get("methods", request.method).raw_schemas if request.method else ()
     stated = {"machine": request.machine, "attributes.axis": request.axis}
     known = {key: text for key, text in stated.items() if text} | dict(request.answers)
+    if (model := own_map(copies)) is not None:
+        while questions := questions_of(model, known):
+            known |= ask(questions)
+        write_own_map(model, known, map_file)
+        return MapOfFiles(map_file)
+    schemas: Sequence[RawSchema] = plugins.get("methods", request.method).raw_schemas if request.method else ()
     found = propose(copies, tuple(schemas), answers=known)
     if not found.questions and not found.schema:
         raise DatasetError(f"{found.notes[0]}; describe them by a map: --map FILE", code="add.file.unknown")
-    if not request.answers and (earlier := known_map(copies, _maps(request.runs))) is not None:
-        contradiction = _contradiction(read_toml(earlier), found, known, request.runs, ask)
+    if not request.answers and (earlier := known_map(copies, _maps(request.record))) is not None:
+        contradiction = _contradiction(read_toml(earlier), found, known, request.record.machines, ask)
         if not contradiction:
             replace_bytes(map_file, earlier.read_bytes())
             return MapOfFiles(map_file, notes=(f"read by the map of {earlier.parent.name}",))
         found = found.answered(contradiction)
     if request.answers:
         found = found.answered(request.answers)  # refuses those to questions that there are not
-    answered, notes, found = _asked(found, request.runs, ask)
+    answered, notes, found = _asked(found, request, ask)
     write_map(found, map_file, overwrite=True)
     return MapOfFiles(map_file, answers=answered | dict(request.answers), notes=notes)
 
 
-def of_machine(question: Question, runs: Path) -> Question:
+def of_machine(question: Question, machines: Sequence[str]) -> Question:
     """Return the question for the machine, with those of the record as choices."""
-    known = list_runs([runs]).machines if runs.is_dir() else ()
-    names = dict.fromkeys(filter(None, (question.proposed, *known)))
+    names = dict.fromkeys(filter(None, (question.proposed, *machines)))
     choices = tuple(Choice(name, name) for name in list(names)[:MAX_CHOICES])
     proposed = question.proposed or (choices[0].value if len(choices) == 1 else "")
     return Question("machine", "On which machine was this measured?", choices, proposed, needed=True)
 
 
-def _asked(found: Proposal, runs: Path, ask: Ask) -> tuple[dict[str, str], tuple[str, ...], Proposal]:
+def _asked(found: Proposal, request: Request, ask: Ask) -> tuple[dict[str, str], tuple[str, ...], Proposal]:
     """Return answers, notes and the proposal without questions; what is known of the machine is not asked."""
     answered: dict[str, str] = {}
     before, mistake = set[str](), ""
     while found.questions:
         machine = str(found.map.get("machine", ""))
-        known = load_machines(runs).answers(machine, found.schema) if machine else {}
+        known = load_machines(request.runs).answers(machine, found.schema) if machine else {}
         new = {each.key: known[each.key] for each in found.questions if each.key in known}
         before |= set(new)
         if not new:
-            questions = [of_machine(each, runs) if each.key == "machine" else each for each in found.questions]
+            names = request.record.machines
+            questions = [of_machine(each, names) if each.key == "machine" else each for each in found.questions]
             questions.sort(key=lambda each: each.key not in _FIRST)
             new = dict(ask(questions, mistake))
         try:
@@ -119,7 +125,7 @@ def _asked(found: Proposal, runs: Path, ask: Ask) -> tuple[dict[str, str], tuple
 
 
 def _contradiction(
-    content: Mapping[str, Any], found: Proposal, known: Mapping[str, str], runs: Path, ask: Ask
+    content: Mapping[str, Any], found: Proposal, known: Mapping[str, str], machines: Sequence[str], ask: Ask
 ) -> dict[str, str]:
     """Return what holds for the files otherwise than in an earlier map; empty if the map can be used for them.
 
@@ -136,15 +142,14 @@ def _contradiction(
         now = known.get(key) or (question.proposed if question is not None else "")
         if not now and question is not None and not key.startswith("values."):
             asked = replace(question, proposed=str(text))
-            asked = of_machine(asked, runs) if key == "machine" else asked
+            asked = of_machine(asked, machines) if key == "machine" else asked
             now = str(text) if len(asked.choices) == 1 else dict(ask([asked]))[key]
         if now and text not in (now, value_of(now)):
             return {key: now}
     return {}
 
 
-def _maps(runs: Path) -> Iterator[Path]:
-    """Yield the maps of imported runs, newest first."""
-    if runs.is_dir():
-        folders = (path for path, entry in list_runs([runs]).runs if entry.imported)
-        yield from islice((path / MAP for path in folders if (path / MAP).is_file()), MAX_MAPS)
+def _maps(record: Listing) -> Iterator[Path]:
+    """Return the maps of imported runs, newest first."""
+    folders = (path for path, entry in record.runs if entry.imported)
+    return islice((path / MAP for path in folders if (path / MAP).is_file()), MAX_MAPS)

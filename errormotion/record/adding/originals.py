@@ -13,7 +13,7 @@ from errormotion.campaign.folder import RunFolder
 from errormotion.datasets.files.reading import leaves, require_regular
 from errormotion.datasets.files.writing import make_folder, whole
 from errormotion.errors import DatasetError
-from errormotion.record.runs.listing import list_runs
+from errormotion.record.runs.listing import Listing
 
 KEPT = "imported"
 """Folder of the copies in a run folder, and key of their description in ``run.json``."""
@@ -99,12 +99,10 @@ def keep(originals: Mapping[Path, Original], folder: Path) -> list[Path]:
     return copies
 
 
-def run_of(originals: Iterable[Original], runs: Path) -> RunFolder | None:
-    """Return the newest run of these files in a folder of runs; None if there is none."""
-    if not runs.is_dir():
-        return None
+def run_of(originals: Iterable[Original], record: Listing) -> RunFolder | None:
+    """Return the newest run of these files; None if there is none."""
     wanted = {each.sha256 for each in originals}
-    for path, entry in list_runs([runs]).runs:
+    for path, entry in record.runs:
         if wanted == set(entry.imported):
             return RunFolder.open(path)
     return None

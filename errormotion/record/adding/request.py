@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+from errormotion.record.runs.listing import Listing, list_runs
 
 
 @dataclass(frozen=True)
@@ -51,3 +54,8 @@ class Request:
     settings: Callable[[Any], Any] = lambda model: model()
     answers: Mapping[str, str] = field(default_factory=dict)
     again: bool = False
+
+    @cached_property
+    def record(self) -> Listing:
+        """The runs that are in the folder."""
+        return list_runs([self.runs]) if self.runs.is_dir() else Listing((), ())
