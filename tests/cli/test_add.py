@@ -229,6 +229,13 @@ def test_the_head_of_the_report_is_stated_in_a_file(run: Run, tmp_path: Path) ->
     for text in ("A. Meier", "Test laboratory", "Smith Ltd", "R-17", "serial number 8F22", "C-4711", "20.3 degC"):
         assert text in page, text
     assert "warm-up: 30 min" in page
+    assert "linear_positioning-X" in page
+    (tmp_path / "de.toml").write_text(HEAD.replace('number = "R-17"', 'language = "de"'))
+    os.utime(tmp_path / "a.csv", (MARCH, MARCH))
+    run("add", "a.csv", "--head", "de.toml", "--runs", "de", *FAST)
+    page = (single(tmp_path / "de").path / "report.html").read_text()
+    for text in ("(letzte Änderung der Datei)", "Importiert aus", "Prüfbedingungen", "Umgebung"):
+        assert text in page, text
     errors = datasets.load(str(folder.errors))
     assert json.loads(errors.attrs["provenance"])["instruments"][0]["identity"]["serial_number"] == "8F22"
     (tmp_path / "head.toml").write_text(HEAD.replace("customer", "costumer"))

@@ -175,6 +175,23 @@ def test_answers_are_remembered_for_the_machine(run: Run, person: Run, tmp_path:
     np.testing.assert_array_equal(first["beam_origin"], second["beam_origin"])
 
 
+def test_the_set_up_of_the_machine_in_the_file_is_not_taken_for_another_one(
+    run: Run, person: Run, tmp_path: Path
+) -> None:
+    person(spindle_log(tmp_path / "a.csv"), types=["1", *SET_UP.values()])
+    (found()[0].path / "map.toml").unlink()
+    other = dict(SET_UP, **{"values.bar_radius": "6 mm"})
+    person(spindle_log(tmp_path / "b.csv", seed=8), types=["DMU 80", *other.values()])
+    first, second = (datasets.load(each.raw) for each in found())
+    assert [float(each["bar_radius"]) for each in (first, second)] == [0.005, 0.006]
+    kept = tmp_path / "runs" / "machines.toml"
+    kept.write_text(kept.read_text().replace('"5 mm"', '"5 kg"'))
+    (found()[1].path / "map.toml").unlink()
+    message = run("add", spindle_log(tmp_path / "c.csv", seed=9), "--yes", "--machine", "DMU 65", code=1).stderr
+    assert "machines.toml" in message
+    assert "bar_radius" in message
+
+
 def test_a_wrong_answer_is_asked_again(person: Run, tmp_path: Path) -> None:
     wrong = ["1", *SET_UP.values()]
     wrong[3:3] = ["5 kg"]

@@ -24,6 +24,7 @@ from errormotion.campaign.folder import RunFolder, first_entries, now
 from errormotion.campaign.runner import identify_run, report_run, settings_hash
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.datasets import provenance
+from errormotion.datasets.files.reading import parse_json
 from errormotion.datasets.files.tomlfile import read_toml
 from errormotion.datasets.maps.questions import Question
 from errormotion.errors import DatasetError, RunError, code_of
@@ -101,7 +102,7 @@ def add(
             stage("identifying")
             identify_run(folder, work.owner(), work.settings)
             if not request.test:
-                folder.data["test"] = f"{work.owner.info.id}-{_component(folder)}"
+                folder.save(test=f"{work.owner.info.id}-{_component(folder)}")
         if report is not None:
             stage("writing the report")
             report_run(folder, report)
@@ -139,7 +140,7 @@ class _Adding:
             raw = self._stated(raw)
             entries = self._entries(raw)
         self.schema = str(raw.attrs["schema"])
-        self.notes = (*self.map.notes, *json.loads(str(raw.attrs.get("import_notes") or "[]")))
+        self.notes = (*self.map.notes, *map(str, _listed(raw, "import_notes")))
         self.stage("storing the raw data")
         datasets.save(raw, folder / "raw.zarr", overwrite=True)
         raw.close()
@@ -201,7 +202,7 @@ class _Adding:
             "method": {"id": ""},
             "operator": str(raw.attrs.get("operator", "")),
             "head": self.statement.stated(),
-            "instruments": json.loads(str(raw.attrs.get("instruments", "[]"))),
+            "instruments": _listed(raw, "instruments"),
             "tolerances": self.limits.model_dump(mode="json") if self.limits else None,
             "errors": None,
             "results": None,
@@ -229,6 +230,15 @@ _NOTHING = {"schema": "errormotion.head/1"}
 def _name(stem: str) -> str:
     """Return a text for the name of a run folder."""
     return re.sub(r"[^\w-]+", "-", stem, flags=re.ASCII).strip("-")[:MAX_NAME] or "file"
+
+
+def _listed(raw: xr.Dataset, name: str) -> list[Any]:
+    """Return the list in an attribute of JSON; empty if there is none."""
+    try:
+        found = parse_json(str(raw.attrs.get(name) or "[]"))
+    except ValueError:
+        return []
+    return found if isinstance(found, list) else []
 
 
 def _component(folder: RunFolder) -> str:

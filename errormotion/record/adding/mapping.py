@@ -18,7 +18,7 @@ from errormotion.datasets.maps.proposal import Choice, Proposal, Question, propo
 from errormotion.datasets.maps.writing import write_map
 from errormotion.datasets.schemas import RawSchema
 from errormotion.errors import DatasetError
-from errormotion.record.adding.machines import load_machines
+from errormotion.record.adding.machines import FILE, load_machines
 from errormotion.record.adding.originals import MAP
 from errormotion.record.adding.own_maps import own_map, questions_of, write_own_map
 from errormotion.record.adding.questions import Ask
@@ -43,7 +43,7 @@ class MapOfFiles:
     file : Path or None
         The map in the run folder; None for files that need none.
     answers : dict of str to str
-        What was answered.
+        What was answered otherwise than proposed.
     notes : tuple of str
     """
 
@@ -105,22 +105,25 @@ def _asked(found: Proposal, request: Request, ask: Ask) -> tuple[dict[str, str],
     answered: dict[str, str] = {}
     before, mistake = set[str](), ""
     while found.questions:
-        machine = str(found.map.get("machine", ""))
-        known = load_machines(request.runs).answers(machine, found.schema) if machine else {}
-        new = {each.key: known[each.key] for each in found.questions if each.key in known}
-        before |= set(new)
-        if not new:
-            names = request.record.machines
-            questions = [of_machine(each, names) if each.key == "machine" else each for each in found.questions]
-            questions.sort(key=lambda each: each.key not in _FIRST)
-            new = dict(ask(questions, mistake))
+        questions = {each.key: each for each in found.questions}
+        stored: dict[str, str] = {}
+        if "machine" not in questions:
+            known = load_machines(request.runs).answers(str(found.map.get("machine", "")), found.schema)
+            stored = {key: known[key] for key in questions if key in known}
+        before |= set(stored)
+        names = request.record.machines
+        asked = [of_machine(each, names) if key == "machine" else each for key, each in questions.items()]
+        new = stored or dict(ask(sorted(asked, key=lambda each: each.key not in _FIRST), mistake))
         try:
             found, mistake = found.answered(new), ""
-            answered |= new
         except DatasetError as error:
             if error.code != "map.answer":
                 raise
+            if stored:
+                raise DatasetError(f"{request.runs / FILE}: {error}", code="map.answer") from error
             mistake = str(error)
+            continue
+        answered |= {key: text for key, text in new.items() if key in questions and text != questions[key].proposed}
     return answered, (*found.notes, *(f"as before on this machine: {key}" for key in sorted(before))), found
 
 

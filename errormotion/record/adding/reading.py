@@ -13,6 +13,7 @@ from errormotion import datasets, plugins
 from errormotion.datasets.importing import import_files
 from errormotion.datasets.storage.disk import reading
 from errormotion.errors import DatasetError
+from errormotion.plugins import Method
 
 _DATASETS = (".nc", ".nc4")
 _HEAD = 1 << 16
@@ -69,8 +70,9 @@ def owner_of(raw: xr.Dataset) -> Any:
     """
     schema = str(raw.attrs.get("schema", "none"))
     owner = plugins.owner_of_schema(schema)
-    if owner is None:
-        raise DatasetError(f"expected raw data of a method; found schema {schema}", code="schema.other")
+    own = {table.id for table in owner.raw_schemas} if owner is not None else set()
+    if owner is None or not (issubclass(owner, Method) or schema in own):
+        raise DatasetError(f"expected raw data of a method, or a log; found schema {schema}", code="schema.other")
     if schema in owner.calibrations:
         raise DatasetError(
             "contains readings for a calibration; use 'errormotion calibrate'", code="raw.for_calibration"

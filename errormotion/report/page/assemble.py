@@ -22,7 +22,7 @@ from errormotion.report.page.head import PAPERS, Head, calibrations, facts, meas
 from errormotion.report.page.language import Catalogue
 from errormotion.report.page.verdict import Verdict
 
-_COMPOSED = ("Method", "Report", "Instruments", "Reference state")
+_COMPOSED = ("Measured", "Method", "Report", "Instruments", "Reference state")
 """Facts whose values are translated; the others are names."""
 
 
