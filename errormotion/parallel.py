@@ -1,4 +1,4 @@
-"""Execution of many small tasks with Dask: in threads or processes of this computer, or on a cluster."""
+"""Execution of many small tasks: in threads or processes of this computer, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from types import TracebackType
@@ -77,7 +77,7 @@ class Workers:
     Raises
     ------
     RunError
-        An unknown scheduler, a cluster that does not answer or has other versions, Dask missing.
+        An unknown scheduler; a cluster that does not answer or has other versions, or Dask is not installed.
     """
 
     def __init__(self, scheduler: str, workers: int | None, version: str) -> None:
@@ -125,41 +125,31 @@ class Workers:
                 done(number, function(*task))
 
     def _locally(self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], done: Done, lost: Lost) -> None:
+        executor: Any = self._executor
+        ended = "the process ended unexpectedly (use fewer --workers if memory is short); repeat the command"
+        futures, unfinished = {}, set(range(len(tasks)))
         try:
-            from dask.base import compute
-            from dask.callbacks import Callback
-            from dask.delayed import delayed
-        except ImportError as error:
-            raise _missing("dask") from error
-        finished: set[int] = set()
-
-        def after(_key: Any, value: Any, *_: Any) -> None:
-            if isinstance(value, _Answer):
-                finished.add(value.number)
-                done(value.number, value.value)
-
-        graph = [delayed(_answer, pure=False)(number, function, task) for number, task in enumerate(tasks)]
-        try:
-            with Callback(posttask=after):
-                compute(*graph, scheduler=self.scheduler, pool=self._executor, chunksize=1)
+            for number, task in enumerate(tasks):
+                futures[executor.submit(function, *task)] = number
+            for future in as_completed(futures):
+                number = futures.pop(future)
+                value = future.result()
+                unfinished.remove(number)
+                done(number, value)
         except BrokenProcessPool:
-            for number in range(len(tasks)):
-                if number not in finished:
-                    lost(
-                        number,
-                        "the process ended unexpectedly (use fewer --workers if memory is short); repeat the command",
-                    )
+            for number in sorted(unfinished):
+                lost(number, ended)
 
     def _on_cluster(
         self, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], done: Done, lost: Lost
     ) -> None:
         from dask.delayed import delayed
-        from distributed import as_completed
+        from distributed import as_completed as completed
 
         client: Any = self._client
         futures = client.compute([delayed(_answer, pure=False)(n, function, task) for n, task in enumerate(tasks)])
         number_of = {future: number for number, future in enumerate(futures)}
-        for future in as_completed(futures, loop=client.loop):
+        for future in completed(futures, loop=client.loop):
             if future.status == "finished":
                 answer = future.result()
                 done(answer.number, answer.value)
@@ -227,7 +217,7 @@ def _check_workers(client: Client, address: str, version: str) -> None:
 
 def _missing(package: str) -> RunError:
     return RunError(
-        f"Parallel execution needs the package '{package}', which is not installed: "
-        "pip install 'errormotion[cluster]'. Without it, '--scheduler sync' executes one task after another.",
+        f"A cluster needs the package '{package}', which is not installed: "
+        "pip install 'errormotion[cluster]'. This computer needs none: --scheduler processes, threads or sync.",
         code="package.missing",
     )

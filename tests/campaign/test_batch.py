@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from coded import raises
 from distributed import LocalCluster
+from ending import end
 
 from errormotion import datasets, parallel, plugins
 from errormotion.campaign import batch, runner
@@ -214,9 +215,9 @@ def test_a_plugin_error_in_one_run_does_not_affect_others(
 def test_a_process_that_ends_unexpectedly_is_reported(
     raws: list[Path], identify: Identify, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "_identify", lambda *_: os._exit(1))
-    (outcome,) = identify(raws[:1], scheduler="processes", workers=1)
-    assert "the process ended unexpectedly" in outcome.reason
+    monkeypatch.setattr(batch, "_identify", end)
+    for outcome in identify(raws[:2], scheduler="processes", workers=1):
+        assert "the process ended unexpectedly" in outcome.reason
 
 
 def test_names_distinguish_runs(tmp_path: Path) -> None:
@@ -268,21 +269,28 @@ def test_errors_are_reported_before_any_action(raws: list[Path], identify: Ident
         identify()
 
 
-@pytest.mark.parametrize(("package", "scheduler"), [("dask", "threads"), ("distributed", "tcp://127.0.0.1:9")])
-def test_without_dask_it_says_what_to_install(
-    identify: Identify, monkeypatch: pytest.MonkeyPatch, package: str, scheduler: str
-) -> None:
-    monkeypatch.setitem(sys.modules, package if package == "distributed" else "dask.base", None)
-    with pytest.raises(RunError, match=rf"'{package}', which is not installed: pip install 'errormotion\[cluster\]'"):
-        identify(scheduler=scheduler)
+def test_a_cluster_without_dask_says_what_to_install(identify: Identify, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(RunError, match=r"'distributed', which is not installed: pip install 'errormotion\[cluster\]'"):
+        identify(scheduler="tcp://127.0.0.1:9")
 
 
-def test_serial_execution_requires_no_dask() -> None:
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_this_computer_requires_no_dask(raws: list[Path], tmp_path: Path, scheduler: str) -> None:
     script = (
-        "import sys, errormotion.campaign.batch as b; print([n for n in ('dask', 'distributed') if n in sys.modules])"
+        "import sys\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name.partition('.')[0] in ('dask', 'distributed'):\n"
+        "            raise ModuleNotFoundError(name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        "from errormotion.cli import main\n"
+        f"main(['identify', {str(raws[0])!r}, {str(raws[1])!r}, '--method', 'spindle_drift', "
+        f"'--out', {str(tmp_path / 'out')!r}, '--scheduler', {scheduler!r}])"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    state = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, env=state)
+    assert "2 identified, 0 existed already, 0 failed" in done.stdout, done.stderr
 
 
 @pytest.mark.slow
