@@ -144,7 +144,7 @@ def test_the_curvature_of_scattered_errors_is_in_the_covariance() -> None:
 
 
 def test_the_uncertainty_between_two_instants_contains_a_step_there() -> None:
-    """Wherever the step is: in the middle one of 3 um deviates by half of it: 1.96 / sqrt(3) is 1.13."""
+    """A step of 3 um deviates from the line by up to 3 um max(w, 1 - w), and 1.96 / sqrt(3) is 1.13."""
     instants, size = np.arange(6) * 600.0, 3e-6
     values = np.zeros((6, 4, 6))
     values[3:] += size

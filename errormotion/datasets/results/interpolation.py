@@ -214,7 +214,7 @@ def steps(t: Array, values: Array, own: Array, *, together: bool = False) -> Arr
     square, noise, count = (each.sum(axis=others, keepdims=True) for each in (square, noise, np.isfinite(size)))
     # sums of squares of c values of noise: noise of its own size, with the relative standard deviation sqrt(2 / c)
     limit = noise * (1 + SIGNIFICANT * np.sqrt(2 / np.maximum(count, 1)))
-    return np.where(square > limit, square, 0.0) / np.maximum(count, 1)
+    return np.asarray(np.where(square > limit, square, 0.0) / np.maximum(count, 1))
 
 
 def variance_beside_a_step(share: Array, square: Array) -> Array:
