@@ -129,7 +129,7 @@ def test_metres_declared_as_millimetres_are_detected(tmp_path: Path) -> None:
         ("S1,1,1500,20,1013,140", "column 'humidity [%]': expected 0 to 100; found 140"),
         ("S1,1,15O0,20,1013,40", "column 'length [mm]': expected a number; found '15O0'"),
         ("S1,,1500,20,1013,40", "column 'target': expected a number or name; found nothing"),
-        ("S1,1,1500,5,20,1013,40", "expected 6 fields; found 7 (the decimal sign is a point)"),
+        ("S1,1,1500,5,20,1013,40", "expected 6 fields; found 7"),
     ],
 )
 def test_wrong_cells_are_named_with_line_and_column(tmp_path: Path, line: str, words: str) -> None:
@@ -160,13 +160,29 @@ def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        ((), "expected lines of measurements"),
+        ((), "expected lines of numbers; found none"),
         (("S1,1,,20,1013,40",), "expected lengths; found none"),
-        (("S1,1,1500,20,1013,40", "", "S1,2,1500,20,1013,40"), "found the start of a second table"),
+        ((*LINES, "", HEAD.replace("humidity [%]", "wind [m/s]"), "S1,3,1500,20,1013,40"), "line 7: column"),
+        ((*LINES, "", "exported by program 3"), "1 line below the table not read, from line 7 on"),
     ],
 )
 def test_tables_without_lengths_or_in_two_parts_are_refused(tmp_path: Path, lines: tuple[str, ...], words: str) -> None:
     assert words in refusal(write(tmp_path, *lines))
+
+
+def test_a_german_table_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "tabelle.csv"
+    lines = [
+        "Messung vom 4.5.2026",
+        "",
+        "Standort;Punkt;Länge [mm];Temperatur [°C]",
+        "S1;P1;1.500,5;20,1",
+        "S1;P2;1.501,25;20,2",
+    ]
+    path.write_bytes("\r\n".join(lines).encode("cp1252") + b"\r\n")
+    with TrackerTable(str(path)) as table:
+        np.testing.assert_allclose(table.read(), [[1.5005, 1.50125]], rtol=1e-15)
+        assert table.environment().temperature == pytest.approx(20.15)
 
 
 def test_files_that_are_not_there_are_refused(tmp_path: Path) -> None:

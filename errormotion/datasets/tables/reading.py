@@ -15,6 +15,8 @@ from errormotion.errors import DatasetError
 MAX_FILE = 1 << 28
 """Largest size of a file, bytes; its cells need more memory."""
 
+_PIECE = 1 << 16
+"""Number of bytes that are read at a time: a short file needs little memory."""
 _BINARY = (
     (b"TDSm", "tdms"),
     (b"\x89HDF\r\n\x1a\n", "hdf5"),
@@ -77,7 +79,7 @@ def _text(path: Path) -> bytes:
     parts: list[bytes] = []
     length = since = line = 0
     with path.open("rb") as file:
-        while part := file.read(MAX_LINE):
+        while part := file.read(_PIECE):
             length += len(part)
             ends = max(part.rfind(b"\n"), part.rfind(b"\r"))
             since = len(part) - ends if ends >= 0 else since + len(part)

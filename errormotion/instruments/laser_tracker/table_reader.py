@@ -1,6 +1,7 @@
 """Conversion of exported tables of trackers to lengths by station and target, in SI; reports all mistakes at once.
 
-A table has a line of column names with their units, and a line for each measurement, in any order::
+A table has a line of column names with their units, and a line for each measurement, in any order. Its form is
+recognised (`errormotion.datasets.tables`): encoding, delimiter, decimal sign, a line of units, sheets::
 
     station,target,length [mm],temperature [degC],pressure [hPa],humidity [%]
     S1,1,1523.40712,20.31,1013.2,45
@@ -22,8 +23,8 @@ from typing import Any, Literal
 import numpy as np
 
 from errormotion.datasets.tables.mistakes import Mistakes
-from errormotion.datasets.tables.numbers import NUMBER
-from errormotion.datasets.text.csv_text import Table, blocks
+from errormotion.datasets.tables.reading import read_table as read_file
+from errormotion.datasets.tables.table import Table, name_of, same
 from errormotion.datasets.units import convert
 from errormotion.errors import DatasetError
 
@@ -43,12 +44,12 @@ class Quantity:
 
 
 QUANTITIES: Mapping[str, Quantity] = {
-    "length": Quantity("m", "mm", -160.0, 160.0, ("displacement", "distance")),
-    "temperature": Quantity("degC", "degC", -20.0, 60.0, ("air_temperature",)),
-    "pressure": Quantity("Pa", "hPa", 5e4, 1.2e5, ("air_pressure",)),
-    "humidity": Quantity("%", "%", 0.0, 100.0, ("relative_humidity",)),
+    "length": Quantity("m", "mm", -160.0, 160.0, ("displacement", "distance", "länge", "distanz", "abstand")),
+    "temperature": Quantity("degC", "degC", -20.0, 60.0, ("air_temperature", "temperatur", "lufttemperatur")),
+    "pressure": Quantity("Pa", "hPa", 5e4, 1.2e5, ("air_pressure", "druck", "luftdruck")),
+    "humidity": Quantity("%", "%", 0.0, 100.0, ("relative_humidity", "feuchte", "luftfeuchte")),
 }
-KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker",), "target": ("point",)}
+KEYS: Mapping[str, tuple[str, ...]] = {"station": ("tracker", "standort"), "target": ("point", "punkt", "ziel")}
 AIR = ("temperature", "pressure", "humidity")
 
 MAX_TABLE = 1 << 24
@@ -58,8 +59,6 @@ MAX_LINES = 100_000
 
 _ENDS, _LONG_ENDS = b"\n\r\x0b\x0c\x1c\x1d\x1e", (b"\xc2\x85", b"\xe2\x80\xa8", b"\xe2\x80\xa9")  # line ends of text
 _MAX_HINTS = 10  # columns for which a name is suggested
-_TITLE = re.compile(r"([^\W\d]\w*(?: \w+)*)\s*(?:[\[(]([^\])]*)[\])]|/\s*(\S.*))?")
-_EMPTY = ("", "NaN", "nan", "-", "---")
 _UNITS = {"°C": "degC", "C": "degC", "K": "kelvin", "mbar": "mbar", "%RH": "%", "% RH": "%", "%rH": "%"}
 
 
@@ -98,7 +97,7 @@ def read_table(
     Parameters
     ----------
     path : Path
-        UTF-8 text, see the module; separated by tabulator, semicolon or comma, the decimal sign is a point.
+        Text or spreadsheet, see the module.
     stations : sequence of str, optional
         Stations in the order of the result; default: those of the table, in its order.
     repeats : {"refuse", "last", "mean"}
@@ -111,29 +110,28 @@ def read_table(
     DatasetError
         The file cannot be read, or has mistakes; the message lists them with line, column, expected and found value.
     """
-    with suppress(OSError):  # `blocks` reports it
+    with suppress(OSError):  # `read_file` reports it
         _refuse_long(path)
-    _, tables = blocks(path)
-    if len(tables) > 1:
-        line = tables[1].head[0]
-        raise DatasetError(
-            f"{path}, line {line}: expected one table without empty lines; found the start of a second table",
-            code="table.lengths.second",
-        )
-    (table,) = tables
+    table = read_file(path)
     mistakes = Mistakes(path)
+    for note in table.notes:
+        mistakes.add(0, f"expected one table of measurements; {note}")
     columns = _columns(table, mistakes)
     mistakes.raise_any()
-    rows = [(line, texts) for line, texts in table.rows if _whole(line, texts, table, mistakes)]
-    if not rows and not mistakes.count:
-        mistakes.add(table.head[0], "expected lines of measurements below the column names; found none")
-    values = {name: _numbers(name, column, unit, rows, table, mistakes) for name, (column, unit) in columns.items()}
-    keys = {name: [texts[column] for _, texts in rows] for name, (column, _) in columns.items() if name in KEYS}
-    names = _names(keys, rows, stations, mistakes)
+    table.report(mistakes)
+    texts = {name: list(table.cells.texts(column)) for name, (column, _) in columns.items() if name in KEYS}
+    shown = {column: f"column '{table.titles[column]}'" for name, (column, _) in columns.items() if name in QUANTITIES}
+    numbers = table.numbers(shown, mistakes)
+    values = {
+        name: _inside(name, numbers[column], unit, shown[column], table, mistakes)
+        for name, (column, unit) in columns.items()
+        if name in QUANTITIES
+    }
+    names = _names(texts, table, stations, mistakes)
     mistakes.raise_any()
-    found = _arranged(names, keys, values, rows, repeats, mistakes)
+    found = _arranged(names, texts, values, table, repeats, mistakes)
     mistakes.raise_any()
-    _check_length(path, found.length, table.head[1][columns["length"][0]], least_length)
+    _check_length(path, found.length, table.titles[columns["length"][0]], least_length)
     return found
 
 
@@ -152,15 +150,14 @@ def _refuse_long(path: Path) -> None:
 
 def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
     """Return index and unit of each known column."""
-    line, titles = table.head
+    line = table.head
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
     others |= {other: name for name, them in KEYS.items() for other in them}
     found: dict[str, tuple[int, str]] = {}
-    for column, title in enumerate(titles):
-        match = _TITLE.fullmatch(title)
-        name = match[1].lower().replace(" ", "_") if match else ""
+    for column, title in enumerate(table.titles):
+        name = name_of(same(title)).lower().replace(" ", "_")
         name = others.get(name, name)
-        unit = ((match[2] or match[3] or "") if match else "").strip()
+        unit = table.units[column]
         if name in found:
             mistakes.add(line, f"column '{title}': expected one column for the {name}; found a second one")
         elif name in KEYS:
@@ -173,7 +170,7 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
             mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):
         if name not in found and not mistakes.count:
-            mistakes.add(line, f"expected a column '{name}'; found {', '.join(titles)}")
+            mistakes.add(line, f"expected a column '{name}'; found {', '.join(table.titles)}")
     return found
 
 
@@ -191,58 +188,32 @@ def _unit(title: str, name: str, unit: str, line: int, mistakes: Mistakes) -> st
     return unit
 
 
-def _whole(line: int, texts: list[str], table: Table, mistakes: Mistakes) -> bool:
-    wanted = len(table.head[1])
-    if len(texts) == wanted:
-        return True
-    comma = " (the decimal sign is a point)" if len(texts) > wanted else ""
-    mistakes.add(line, f"expected {wanted} fields; found {len(texts)}{comma}")
-    return False
-
-
-def _numbers(
-    name: str, column: int, unit: str, rows: list[tuple[int, list[str]]], table: Table, mistakes: Mistakes
-) -> Array:
-    """Return the numbers of a column in SI; NaN where missing. Empty for a column of names."""
-    if name in KEYS:
-        return np.empty(0)
-    quantity, title = QUANTITIES[name], table.head[1][column]
-    values = np.full(len(rows), np.nan)
-    for k, (line, texts) in enumerate(rows):
-        text = texts[column]
-        if text in _EMPTY:
-            continue
-        if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
-            comma = " (the decimal sign is a point)" if "," in text else ""
-            mistakes.add(line, f"column '{title}': expected a number; found '{text}'{comma}")
-            continue
-        values[k] = float(text)
+def _inside(name: str, values: Array, unit: str, title: str, table: Table, mistakes: Mistakes) -> Array:
+    """Return the numbers of a column in SI, (n,); NaN where missing."""
+    quantity = QUANTITIES[name]
     inside = np.asarray(convert(values, unit, quantity.unit), dtype=float)
     for k in map(int, np.flatnonzero((inside < quantity.low) | (inside > quantity.high))):
         low, high = (convert(limit, quantity.unit, unit) for limit in (quantity.low, quantity.high))
         mistakes.add(
-            rows[k][0],
-            f"column '{title}': expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Check its unit, {unit}",
+            int(table.lines[k]),
+            f"{title}: expected {low:.6g} to {high:.6g}; found {values[k]:.9g}. Check its unit, {unit}",
         )
     return inside
 
 
 def _names(
-    keys: dict[str, list[str]],
-    rows: list[tuple[int, list[str]]],
-    stations: Sequence[str] | None,
-    mistakes: Mistakes,
+    keys: dict[str, list[str]], table: Table, stations: Sequence[str] | None, mistakes: Mistakes
 ) -> dict[str, tuple[str, ...]]:
     """Return the names of stations in their order, and of targets by number or in the table's order."""
     for name, texts in keys.items():
-        for (line, _), text in zip(rows, texts, strict=True):
+        for line, text in zip(table.lines, texts, strict=True):
             if not text:
-                mistakes.add(line, f"column '{name}': expected a number or name; found nothing")
+                mistakes.add(int(line), f"column '{name}': expected a number or name; found nothing")
     found = {name: tuple(dict.fromkeys(texts)) for name, texts in keys.items()}
     if stations is not None:
-        for (line, _), text in zip(rows, keys["station"], strict=True):
+        for line, text in zip(table.lines, keys["station"], strict=True):
             if text and text not in stations:
-                mistakes.add(line, f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
+                mistakes.add(int(line), f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
         found["station"] = tuple(stations)
     if all(re.fullmatch("[0-9]{1,9}", text) for text in found["target"]):
         found["target"] = tuple(sorted(found["target"], key=int))
@@ -253,7 +224,7 @@ def _arranged(
     names: dict[str, tuple[str, ...]],
     keys: dict[str, list[str]],
     values: dict[str, Array],
-    rows: list[tuple[int, list[str]]],
+    table: Table,
     repeats: Repeats,
     mistakes: Mistakes,
 ) -> Readings:
@@ -265,8 +236,8 @@ def _arranged(
         group = groups.setdefault((indices["station"][station], indices["target"][target]), [])
         if group and repeats == "refuse":
             mistakes.add(
-                rows[k][0],
-                f"station '{station}', target '{target}': expected one line; line {rows[group[0]][0]} is another. "
+                int(table.lines[k]),
+                f"station '{station}', target '{target}': expected one line; line {table.lines[group[0]]} is another. "
                 "Remove one, or set 'repeats'",
             )
         group.append(k)
@@ -283,7 +254,7 @@ def _arranged(
         names["target"],
         **found,
         missing={why: count for why, count in missing.items() if count},
-        repeated=len(rows) - len(groups),
+        repeated=len(table.lines) - len(groups),
     )
 
 
