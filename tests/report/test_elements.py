@@ -12,6 +12,7 @@ from errormotion.plugins import FigureOfMerit, Method
 from errormotion.report import write_report
 from errormotion.report.document import Cell, Figure, Source, Text
 from errormotion.report.elements import (
+    NOT_DETERMINED,
     Across,
     AgainstLimits,
     Budget,
@@ -586,3 +587,10 @@ def test_groups_of_sources_may_have_further_words_in_the_budget():
     assert [row[0] for row in table.rows] == [
         *("gain", "noise, independent from angle to angle", "combined, k = 1", "expanded, k = 2"),
     ]
+
+
+@pytest.mark.usefixtures("foreign")
+def test_errors_that_are_unknown_at_all_places_are_named():
+    assert NOT_DETERMINED.text(Source(over_angles())) == "Not determined: ECC. Reported as unknown, not as zero."
+    known = over_angles().assign(EC=("angle", np.zeros(24), {"units": "rad"}))
+    assert NOT_DETERMINED.text(Source(known)) == ""

@@ -12,6 +12,7 @@ from errormotion.report.elements.limits import AgainstLimits
 from errormotion.report.elements.quantities import Of
 from errormotion.report.elements.sensors import Sensors
 from errormotion.report.elements.standard import (
+    NOT_DETERMINED,
     PROVENANCE,
     UNCERTAINTY,
     Budget,
@@ -25,6 +26,7 @@ from errormotion.report.elements.tables import Column, KeyValue, Table
 from errormotion.report.elements.timelines import LargestAndLast, Timeline, TimePanel
 
 __all__ = [
+    "NOT_DETERMINED",
     "PROVENANCE",
     "UNCERTAINTY",
     "Across",

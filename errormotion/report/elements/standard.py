@@ -12,10 +12,10 @@ from errormotion.datasets.results.places import place_of
 from errormotion.report import budget, document, provenance, quality
 from errormotion.report.budget import FREEDOMS
 from errormotion.report.document import Block, Cell, Source, Text, or_dash
-from errormotion.report.elements.chapter import Section
+from errormotion.report.elements.chapter import Section, Sentence
 from errormotion.report.elements.quantities import FIELD, unit_of
 from errormotion.report.elements.tables import Column, Table
-from errormotion.report.text import DASH, decimals_of, finite, fixed, percent, significant
+from errormotion.report.text import DASH, decimals_of, finite, fixed, listed, percent, significant
 
 UNSEEN = "not observed by this method"
 WORDS = {"time": "instant"}
@@ -176,5 +176,12 @@ class Provenance:
         return provenance.blocks(source)
 
 
+def _not_determined(errors: xr.Dataset) -> str | None:
+    names = errors.em.iso_names()
+    return listed([names[name] for name in errors.em.names if not np.isfinite(errors[name].values).any()]) or None
+
+
+NOT_DETERMINED = Sentence("Not determined: {names}. Reported as unknown, not as zero.", {"names": _not_determined})
+"""Which errors the measurement does not determine at any place."""
 UNCERTAINTY = Section("uncertainty", "Uncertainty", (Spans(), Budget()))
 PROVENANCE = Section("provenance", "Provenance", (Provenance(),))

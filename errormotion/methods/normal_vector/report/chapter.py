@@ -13,6 +13,7 @@ from errormotion.methods.normal_vector.schema import flag_text
 from errormotion.report.document import Block, Source, Text, estimate
 from errormotion.report.drawings.series import commanded_speed
 from errormotion.report.elements import (
+    NOT_DETERMINED,
     PROVENANCE,
     Budget,
     Chapter,
@@ -114,10 +115,6 @@ def _excluded(errors: xr.Dataset) -> str | None:
     counts = [(int((code == kind).sum()), name) for kind, name in balls.KINDS]
     some = listed([f"{integer(count)} {name}" for count, name in counts if count])
     return f"{integer(code.size)} {balls.what(errors)}: {some}" if some else None
-
-
-def _undetermined(errors: xr.Dataset) -> str | None:
-    return listed([name for name in DOF if not np.isfinite(errors[name].values).any()]) or None
 
 
 def _reasons(errors: xr.Dataset) -> dict[str, str]:
@@ -228,7 +225,7 @@ CHAPTER = Chapter(
         _warmest,
         Sentence("Excluded of {counts}.", {"counts": _excluded}),
         Sentence("Moved on the table: {names}.", {"names": lambda errors: listed(balls.moved_names(errors)) or None}),
-        Sentence("Not determined: {names}. Reported as unknown, not as zero.", {"names": _undetermined}),
+        NOT_DETERMINED,
         Section(
             "errors",
             "Errors and temperatures",

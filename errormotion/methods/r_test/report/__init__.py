@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import xarray as xr
 
 from errormotion.datasets.results.merit import is_planned
-from errormotion.kinematics.iso import DOF
 from errormotion.report.document import Part, Source
 from errormotion.report.elements import (
+    NOT_DETERMINED,
     PROVENANCE,
     UNCERTAINTY,
     Chapter,
@@ -25,7 +24,6 @@ from errormotion.report.elements import (
     Sentence,
 )
 from errormotion.report.page.language import texts_of
-from errormotion.report.text import listed
 
 LOCATION, RANGE = ("E*0*",), ("range of *",)
 """Names of the figures of merit."""
@@ -58,13 +56,6 @@ def _point(errors: xr.Dataset) -> str:
     return ", ".join(f"{1e3 * each:.6g}" for each in errors.attrs["functional_point"])
 
 
-def _unseen(source: Source) -> list[str]:
-    """Return which error motions the spheres do not determine."""
-    names = source.errors.em.iso_names()
-    unseen = [names[name] for name in DOF if not np.isfinite(source.errors[name].values).any()]
-    return [f"Not determined: {listed(unseen)}. Reported as unknown, not as zero."] if unseen else []
-
-
 CHAPTER = Chapter(
     "R-test of rotary axis {component}",
     (
@@ -74,7 +65,7 @@ CHAPTER = Chapter(
             {"angles": _number_of("angle"), "spheres": _spheres, "sensors": _number_of("sensor")},
         ),
         Sentence("The errors are those at the point ({point}) mm in the frame '{frame}'.", {"point": _point}),
-        _unseen,
+        NOT_DETERMINED,
         Section(
             "location",
             "Location errors",

@@ -8,9 +8,9 @@ import numpy as np
 import xarray as xr
 
 from errormotion.datasets.results.merit import is_planned
-from errormotion.kinematics.iso import DOF
 from errormotion.report.document import Part, Source
 from errormotion.report.elements import (
+    NOT_DETERMINED,
     PROVENANCE,
     UNCERTAINTY,
     Chapter,
@@ -26,7 +26,7 @@ from errormotion.report.elements import (
 )
 from errormotion.report.elements.panels import Panel
 from errormotion.report.page.language import texts_of
-from errormotion.report.text import fixed, integer, listed
+from errormotion.report.text import fixed, integer
 
 KEY = (
     "synchronous radial, rotating",
@@ -81,13 +81,6 @@ def _plot(name: str) -> Panel:
     return (mean, outer, inner)
 
 
-def _unseen(source: Source) -> list[str]:
-    """Return which error motions the sensors do not determine."""
-    names = source.errors.em.iso_names()
-    unseen = [names[name] for name in DOF if not np.isfinite(source.errors[name].values).any()]
-    return [f"Not determined: {listed(unseen)}. Reported as unknown, not as zero."] if unseen else []
-
-
 def _number(name: str) -> Callable[[xr.Dataset], str]:
     return lambda errors: integer(int(errors.attrs[name]))
 
@@ -107,7 +100,7 @@ CHAPTER = Chapter(
             {name: _number(name) for name in ("turns", "samples", "harmonics")},
         ),
         Sentence("Eccentricity of the artefact, removed: {size}.", {"size": _eccentric}),
-        _unseen,
+        NOT_DETERMINED,
         Section(
             "polar",
             "Polar plots",
