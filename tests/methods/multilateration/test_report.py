@@ -11,8 +11,10 @@ import xarray as xr
 
 from errormotion.datasets import build_errors, provenance
 from errormotion.methods.multilateration import Multilateration, simulation
+from errormotion.methods.multilateration.report import chapters
 from errormotion.methods.multilateration.report.network import longest, network, thinned
 from errormotion.report import write_report
+from errormotion.report.document import Source
 from errormotion.report.drawings.turntable import Ellipsoids, Lines, Scene, camera, draw, enlargement
 from errormotion.twin import VirtualMachine
 
@@ -116,6 +118,19 @@ def test_result_is_not_changed(tmp_path):
     network(errors)
     page(errors, tmp_path, raw=raw)
     xr.testing.assert_identical(errors, before)
+
+
+def test_used_readings_are_counted_at_the_head_and_by_station():
+    errors, raw = measured()
+    used = np.isfinite(errors["residual"].values) & (errors["left_out"].values == 0)
+    (part,) = chapters(Source(errors, raw))
+    (count,) = [figure for figure in part.key_figures if figure.label == "readings"]
+    assert (count.value.text, count.unit, count.note) == (str(used.sum()), "", "used; 1 ignored")
+    (table,) = [
+        block for section in part.sections for block in section.blocks if "dead paths" in getattr(block, "caption", "")
+    ]
+    column = list(table.head).index("used")
+    assert [row[column].text for row in table.rows] == [str(number) for number in used.sum(axis=1)]
 
 
 def test_missing_readings_are_counted_without_the_outlier(html):

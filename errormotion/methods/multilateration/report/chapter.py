@@ -45,7 +45,9 @@ def _expanded(net: xr.Dataset) -> xr.DataArray:
 def _count(net: xr.Dataset) -> xr.DataArray | None:
     """Return which readings are used; None without residuals."""
     found = used(net)
-    return found.notnull().astype(float) if np.isfinite(net["residual"]).any() else None
+    if not np.isfinite(net["residual"]).any():
+        return None
+    return found.copy(data=np.isfinite(found.values).astype(float)).assign_attrs(units="1")
 
 
 def _deviation(net: xr.Dataset) -> xr.DataArray:
