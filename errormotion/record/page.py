@@ -191,8 +191,8 @@ def _chart_figure(ds: xr.Dataset, key: str) -> Figure:
 
     caption = (
         "Individual values with control limits at three standard deviations from the centre, which result from the "
-        "reproducibility (moving ranges; wider where runs are alike) and the stated uncertainty of each run. Centre and "
-        "limits are determined again after each step."
+        "reproducibility (moving ranges; wider where runs are alike) and the stated uncertainty of each run. Centre "
+        "and limits are determined again after each step."
     )
     words = f"Control chart of {ds.sizes['run']} values, {out.sum():.0f} outside"
     return _figure(ds, key, "chart", curves, caption, words)
