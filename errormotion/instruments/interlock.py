@@ -74,17 +74,17 @@ class Interlock:
     def position(self, point: Sequence[float], what: str = "position") -> list[float]:
         """Return X, Y, Z, m; InstrumentError unless they are finite and within the limits."""
         try:
-            found = [float(x) for x in point]
+            coordinates = [float(x) for x in point]
         except (TypeError, ValueError, OverflowError):
-            found = []
-        if len(found) != 3 or not all(map(math.isfinite, found)):
+            coordinates = []
+        if len(coordinates) != 3 or not all(map(math.isfinite, coordinates)):
             raise InstrumentError(
                 f"{self._where}: expected a {what} of three finite numbers X, Y, Z; found {point!r}",
                 code="position.form",
             )
-        for axis, x in zip("XYZ", found, strict=True):
+        for axis, x in zip("XYZ", coordinates, strict=True):
             self.coordinate(axis, x)
-        return found
+        return coordinates
 
     def extent(self, displacement: Sequence[float], what: str) -> None:
         """Raise InstrumentError unless a displacement, (3,) m, is finite and fits between the limits of each axis."""
@@ -129,22 +129,22 @@ class Interlock:
         self, value: float, what: str, limit: float | None, scale: float, unit: str, positive: bool = False
     ) -> float:
         try:
-            found = float(value)
+            number = float(value)
         except (TypeError, ValueError, OverflowError):
-            found = math.nan
-        if not math.isfinite(found * scale) or (positive and found <= 0):
+            number = math.nan
+        if not math.isfinite(number * scale) or (positive and number <= 0):
             above = " above 0" if positive else ""
             raise InstrumentError(
                 f"{self._where}: expected a finite {what}{above}; found {str(value)[:60]}. Nothing was sent",
                 code="motion.value.form",
             )
-        if limit is not None and abs(found) > limit * (1 + _ROUNDING):
+        if limit is not None and abs(number) > limit * (1 + _ROUNDING):
             raise InstrumentError(
-                f"{self._where}: the {what} would be {found * scale:.6g} {unit}; the limit of the bench is "
+                f"{self._where}: the {what} would be {number * scale:.6g} {unit}; the limit of the bench is "
                 f"{limit * scale:.6g} {unit}. Nothing was sent",
                 code="motion.limit.value",
             )
-        return found
+        return number
 
 
 class OffsetInterlock:
@@ -197,20 +197,20 @@ class OffsetInterlock:
                 f"{self._where} is not armed; it only reads. Nothing was sent", code="instrument.not_armed"
             )
         try:
-            found = [float(value) for value in values]
+            numbers = [float(value) for value in values]
         except (TypeError, ValueError, OverflowError):
-            found = []
-        if len(found) != 3 or not all(map(math.isfinite, found)):
+            numbers = []
+        if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
             raise InstrumentError(
                 f"{self._where}: expected offsets of three finite numbers X, Y, Z; found {str(values)[:80]}. Nothing "
                 "was sent",
                 code="offset.form",
             )
-        if max(map(abs, found)) > self.limit * (1 + ROUNDING):
-            texts = ", ".join(f"{value * 1e6:.6g}" for value in found)
+        if max(map(abs, numbers)) > self.limit * (1 + ROUNDING):
+            texts = ", ".join(f"{value * 1e6:.6g}" for value in numbers)
             raise InstrumentError(
                 f"{self._where}: an offset of {texts} um is beyond the limit of {self.limit * 1e6:g} um. Nothing was "
                 "sent",
                 code="offset.beyond_limit",
             )
-        return found[0], found[1], found[2]
+        return numbers[0], numbers[1], numbers[2]

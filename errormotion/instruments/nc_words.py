@@ -143,10 +143,10 @@ def code_of(text: str) -> str:
 
 def words_of(text: str) -> list[tuple[str, str]]:
     """Return letter and number of each word of a line with expressions; the number is empty if it is computed."""
-    found = _NAME.sub("", code_of(text))
-    while (shorter := _INSIDE.sub("#", found)) != found:
-        found = shorter
-    return _WORD.findall(_VALUE.sub("#", _FUNCTION.sub("#", _VALUE.sub("#", found))))
+    rest = _NAME.sub("", code_of(text))
+    while (shorter := _INSIDE.sub("#", rest)) != rest:
+        rest = shorter
+    return _WORD.findall(_VALUE.sub("#", _FUNCTION.sub("#", _VALUE.sub("#", rest))))
 
 
 def codes_of(text: str) -> list[str]:
@@ -156,8 +156,8 @@ def codes_of(text: str) -> list[str]:
 
 def printing(text: str) -> tuple[str, str] | None:
     """Return command and template of a line that prints: ``POPEN``, ``PCLOS`` or ``DPRNT``; None for other lines."""
-    found = _PRINTING.fullmatch(COMMENT.sub(" ", text).strip().upper())
-    return (found[1][:5], found[2] or "") if found is not None else None
+    match = _PRINTING.fullmatch(COMMENT.sub(" ", text).strip().upper())
+    return (match[1][:5], match[2] or "") if match is not None else None
 
 
 def is_title(text: str) -> bool:

@@ -98,11 +98,11 @@ class LinuxCNCOffset(Driver):
         """
         self._interlock.arm(limit)
         try:
-            found = self._state()
-            if found.limit < limit * (1 - 1e-6):
+            state = self._state()
+            if state.limit < limit * (1 - 1e-6):
                 raise InstrumentError(
                     f"{self.address}: expected [ERRORMOTION] LIMIT of at least {1e6 * limit:g} um in LinuxCNC's INI "
-                    f"file; found {1e6 * found.limit:g} um",
+                    f"file; found {1e6 * state.limit:g} um",
                     code="linuxcnc.limit.too_small",
                 )
             self._claim(self.transport)
@@ -118,11 +118,11 @@ class LinuxCNCOffset(Driver):
         InstrumentError
             No answer; the connection is closed, and `open` opens another one.
         """
-        found = self._state()
-        fault = found.fault
-        if not fault and found.by and not self._may_write:
-            fault = f"another program compensates the machine: {found.by}"
-        return Applied(found.offset, found.busy, fault)
+        state = self._state()
+        fault = state.fault
+        if not fault and state.by and not self._may_write:
+            fault = f"another program compensates the machine: {state.by}"
+        return Applied(state.offset, state.busy, fault)
 
     def write(self, offset: Sequence[float]) -> None:
         """Set the offset of X, Y, Z, m; also a heartbeat for the watchdog.
@@ -146,14 +146,14 @@ class LinuxCNCOffset(Driver):
             codec.decode_welcome(self._hello(self.transport, compensate=False))
 
     def _state(self) -> codec.Offset:
-        found = codec.decode_offset(self._request("offset"))
-        if found.route != self.route:
+        state = codec.decode_offset(self._request("offset"))
+        if state.route != self.route:
             raise InstrumentError(
                 f"{self.address}: expected ROUTE = {self.route} in LinuxCNC's INI file for {self.info.id}; found "
-                f"{found.route}",
+                f"{state.route}",
                 code="linuxcnc.route.other",
             )
-        return found
+        return state
 
     def _claim(self, line: Transport) -> None:
         if not isinstance(line, ReplayTransport):

@@ -108,13 +108,13 @@ class ModbusRegisters(ModbusDriver):
         """
         settings = self.settings
         wanted = {first + i: 0 for first, n in settings.states.items() for i in range(n)}
-        found = self._read(wanted)
+        values = self._read(wanted)
         size = SIZES[settings.type]
         x, y, z = (
-            settings.count([found[first + i] for i in range(size)]) * settings.scale
+            settings.count([values[first + i] for i in range(size)]) * settings.scale
             for first in settings.applied or settings.offset
         )
-        return Applied((x, y, z), self._state(found, "busy"), self._state(found, "stop"))
+        return Applied((x, y, z), self._state(values, "busy"), self._state(values, "stop"))
 
     def write(self, offset: Sequence[float]) -> None:
         """Write the offset of X, Y, Z, m, and the next number of the heartbeat.
@@ -148,17 +148,17 @@ class ModbusRegisters(ModbusDriver):
     def _write_owner(self, number: int) -> None:
         self.line.write_registers(self.settings.owner or 0, [number], function=self.settings.function)
 
-    def _state(self, found: dict[int, int], name: str) -> str:
+    def _state(self, values: dict[int, int], name: str) -> str:
         register = getattr(self.settings, name)
-        value = found[register] if register is not None else 0
+        value = values[register] if register is not None else 0
         return f"the PLC states {name} (register {register} is {value})" if value else ""
 
     def _read(self, wanted: dict[int, int]) -> dict[int, int]:
         """Return registers by their numbers."""
-        found: dict[int, int] = {}
+        values: dict[int, int] = {}
         for first, part in runs(wanted, MAX_READ):
-            found.update(enumerate(self.line.registers(READ_HOLDING, first, len(part)), start=first))
-        return found
+            values.update(enumerate(self.line.registers(READ_HOLDING, first, len(part)), start=first))
+        return values
 
     def _start_session(self) -> None:
         """Continue from the last heartbeat, so that the first write changes it; check the other registers."""

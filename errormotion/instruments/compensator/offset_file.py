@@ -83,8 +83,8 @@ class OffsetFile:
                 f"{self.address}: expected a folder {self.path.parent}; found none", code="offset.folder.missing"
             )
         if self.path.exists():
-            found = self._content(self.path)
-            number = found.get("number", 0)
+            content = self._content(self.path)
+            number = content.get("number", 0)
             self._number = number if isinstance(number, int) and not isinstance(number, bool) else 0
         self._open = True
 
@@ -114,9 +114,9 @@ class OffsetFile:
                     code="offset.file.missing",
                 )
             return Applied((0.0, 0.0, 0.0))
-        found = self._content(source)
-        offset = [_number(found.get(axis)) for axis in "XYZ"]
-        return Applied((offset[0], offset[1], offset[2]), _text(found, "busy"), _text(found, "fault"))
+        content = self._content(source)
+        offset = [_number(content.get(axis)) for axis in "XYZ"]
+        return Applied((offset[0], offset[1], offset[2]), _text(content, "busy"), _text(content, "fault"))
 
     def write(self, offset: Sequence[float]) -> None:
         """Replace the file.
@@ -150,12 +150,12 @@ class OffsetFile:
                 text = file.read(LONGEST + 1)
             if len(text) > LONGEST:
                 raise ValueError(f"longer than {LONGEST} bytes")
-            found = json.loads(text)
-            if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+            content = json.loads(text)
+            if not isinstance(content, dict) or content.get("schema") != SCHEMA:
                 raise ValueError(f"expected an object with the schema {SCHEMA}")
         except (OSError, ValueError, RecursionError) as error:
             raise InstrumentError(f"{path} is not a file of offsets: {error}", code="offset.file.form") from None
-        return found
+        return content
 
 
 def _number(value: Any) -> float:
@@ -163,6 +163,6 @@ def _number(value: Any) -> float:
     return float(value) if known else math.nan
 
 
-def _text(found: dict[str, Any], key: str) -> str:
-    value = found.get(key, "")
+def _text(content: dict[str, Any], key: str) -> str:
+    value = content.get(key, "")
     return value[:200] if isinstance(value, str) else f"{key} is not a text"

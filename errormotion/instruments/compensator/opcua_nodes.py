@@ -245,14 +245,19 @@ class OpcUaNodes(Driver):
         """Check the nodes, and continue from the last heartbeat, so that the first write changes it."""
         settings = self.settings
         nodes = (*settings.offset, settings.heartbeat, *filter(None, (settings.owner,)))
-        found = request(self.transport, {"describe": list(nodes)})
-        if not isinstance(found, list) or len(found) != len(nodes) or not all(isinstance(each, dict) for each in found):
+        descriptions = request(self.transport, {"describe": list(nodes)})
+        if (
+            not isinstance(descriptions, list)
+            or len(descriptions) != len(nodes)
+            or not all(isinstance(each, dict) for each in descriptions)
+        ):
             raise ProtocolError(
-                f"{self.address}: expected descriptions of nodes; found {str(found)[:80]}", code="protocol.opc.form"
+                f"{self.address}: expected descriptions of nodes; found {str(descriptions)[:80]}",
+                code="protocol.opc.form",
             )
-        types = [str(each.get("type")) for each in found]
+        types = [str(each.get("type")) for each in descriptions]
         self._types, self._owner_type = types[:4], types[-1]
-        for node, each, kind in zip(nodes, found, types, strict=True):
+        for node, each, kind in zip(nodes, descriptions, types, strict=True):
             allowed: Collection[str] = (*SIGNED, *FRACTIONS)
             if node == settings.heartbeat:
                 allowed = (*SIGNED, *UNSIGNED)

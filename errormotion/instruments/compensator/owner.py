@@ -64,10 +64,10 @@ class Owner:
         InstrumentError
             Another program is the owner now; or as for `take`.
         """
-        found = self._read()
-        if found == FREE:
+        number = self._read()
+        if number == FREE:
             self.take()
-        self._refuse_other(found)
+        self._refuse_other(number)
 
     def release(self) -> None:
         """Give the right back; a lost connection is ignored, since the watchdog of the machine then ends it."""
@@ -77,12 +77,12 @@ class Owner:
                 if self._read() == self.number:
                     self._write(FREE)
 
-    def _refuse_other(self, found: int, *, free: bool = True) -> None:
-        if found == self.number or (free and found == FREE):
+    def _refuse_other(self, number: int, *, free: bool = True) -> None:
+        if number == self.number or (free and number == FREE):
             return
         raise InstrumentError(
             f"{self._where}: another program writes the offsets of this machine, maybe on another computer: their "
-            f"owner is {found}, this program is {self.number}. No offset was sent. Stop the other one; if it was "
+            f"owner is {number}, this program is {self.number}. No offset was sent. Stop the other one; if it was "
             "killed, the program of the machine sets the owner to 0 as its watchdog ends the compensation",
             code="offset.owner.other",
         )

@@ -76,12 +76,12 @@ def _whole(text: str) -> int:
 def event_fields(event: Any) -> dict[str, Any]:
     """Return an event (a mapping, or an object with these attributes) as an object for JSON."""
     names = ("time", "spindle_speed", "compensation")
-    found = event if isinstance(event, Mapping) else {name: getattr(event, name, None) for name in names}
-    if found.get("time") is None or set(found) - set(names):
+    stated = event if isinstance(event, Mapping) else {name: getattr(event, name, None) for name in names}
+    if stated.get("time") is None or set(stated) - set(names):
         raise InstrumentError(
             f"Expected an event with time, spindle_speed and compensation; found {event!r}", code="event.form"
         )
-    fields: dict[str, Any] = {name: found[name] for name in names if found.get(name) is not None}
+    fields: dict[str, Any] = {name: stated[name] for name in names if stated.get(name) is not None}
     if "compensation" in fields:
         fields["compensation"] = dict(fields["compensation"])
     return fields
@@ -368,14 +368,14 @@ class VirtualController(Driver):
             stop: nothing moves.
         """
         goal, feed = self._interlock.position(target, "target"), self._interlock.feed(feed)
-        found = self._facts("probe", "tripped", "position", "time", target=goal, feed=feed)
+        facts = self._facts("probe", "tripped", "position", "time", target=goal, feed=feed)
         try:
-            position = None if found["position"] is None else [float(x) for x in found["position"]]
+            position = None if facts["position"] is None else [float(x) for x in facts["position"]]
         except (TypeError, ValueError):
             raise ProtocolError(
-                f"Expected a position; found {str(found['position'])[:200]}", code="protocol.reply.form"
+                f"Expected a position; found {str(facts['position'])[:200]}", code="protocol.reply.form"
             ) from None
-        return {**found, "position": position}
+        return {**facts, "position": position}
 
     def spindle(self, speed: float) -> None:
         """Turn the spindle at a speed in 1/min; 0 stops it.
@@ -435,13 +435,13 @@ class VirtualController(Driver):
 
     def _facts(self, op: str, *required: str, **arguments: Any) -> dict[str, Any]:
         """Return the result of a request, a mapping with the required keys."""
-        found = self._call(op, **arguments) if op in _READING else self._change(op, **arguments)
-        if not isinstance(found, dict) or (missing := [key for key in required if key not in found]):
-            what = ", ".join(missing) if isinstance(found, dict) else ", ".join(required)
+        facts = self._call(op, **arguments) if op in _READING else self._change(op, **arguments)
+        if not isinstance(facts, dict) or (missing := [key for key in required if key not in facts]):
+            what = ", ".join(missing) if isinstance(facts, dict) else ", ".join(required)
             raise ProtocolError(
-                f"The answer to '{op}' lacks {what}; found {str(found)[:200]}", code="protocol.reply.field"
+                f"The answer to '{op}' lacks {what}; found {str(facts)[:200]}", code="protocol.reply.field"
             )
-        return found
+        return facts
 
     def _events(self, schedule: Iterable[Any]) -> list[dict[str, Any]]:
         """Return the events of a schedule; InstrumentError unless their spindle speeds are within the limits."""

@@ -153,25 +153,25 @@ def _columns(table: Table, mistakes: Mistakes) -> dict[str, tuple[int, str]]:
     line = table.head
     others = {other: name for name, quantity in QUANTITIES.items() for other in quantity.names}
     others |= {other: name for name, them in KEYS.items() for other in them}
-    found: dict[str, tuple[int, str]] = {}
+    columns: dict[str, tuple[int, str]] = {}
     for column, title in enumerate(table.titles):
         name = name_of(same(title)).lower().replace(" ", "_")
         name = others.get(name, name)
         unit = table.units[column]
-        if name in found:
+        if name in columns:
             mistakes.add(line, f"column '{title}': expected one column for the {name}; found a second one")
         elif name in KEYS:
-            found[name] = (column, "")
+            columns[name] = (column, "")
         elif name in QUANTITIES:
-            found[name] = (column, _unit(title, name, unit, line, mistakes))
+            columns[name] = (column, _unit(title, name, unit, line, mistakes))
         else:
             near = get_close_matches(name, [*KEYS, *QUANTITIES, *others], n=1) if mistakes.count < _MAX_HINTS else []
             hint = f"; did you mean '{near[0]}'?" if near else ""
             mistakes.add(line, f"column '{title}': expected one of {', '.join([*KEYS, *QUANTITIES])}{hint}")
     for name in ("station", "target", "length"):
-        if name not in found and not mistakes.count:
+        if name not in columns and not mistakes.count:
             mistakes.add(line, f"expected a column '{name}'; found {', '.join(table.titles)}")
-    return found
+    return columns
 
 
 def _unit(title: str, name: str, unit: str, line: int, mistakes: Mistakes) -> str:
@@ -209,15 +209,15 @@ def _names(
         for line, text in zip(table.lines, texts, strict=True):
             if not text:
                 mistakes.add(int(line), f"column '{name}': expected a number or name; found nothing")
-    found = {name: tuple(dict.fromkeys(texts)) for name, texts in keys.items()}
+    names_by_key = {name: tuple(dict.fromkeys(texts)) for name, texts in keys.items()}
     if stations is not None:
         for line, text in zip(table.lines, keys["station"], strict=True):
             if text and text not in stations:
                 mistakes.add(int(line), f"column 'station': expected one of {', '.join(stations)}; found '{text}'")
-        found["station"] = tuple(stations)
-    if all(re.fullmatch("[0-9]{1,9}", text) for text in found["target"]):
-        found["target"] = tuple(sorted(found["target"], key=int))
-    return found
+        names_by_key["station"] = tuple(stations)
+    if all(re.fullmatch("[0-9]{1,9}", text) for text in names_by_key["target"]):
+        names_by_key["target"] = tuple(sorted(names_by_key["target"], key=int))
+    return names_by_key
 
 
 def _arranged(
@@ -241,18 +241,18 @@ def _arranged(
                 "Remove one, or set 'repeats'",
             )
         group.append(k)
-    found = {name: np.full(shape, np.nan) for name in QUANTITIES}
+    arrays = {name: np.full(shape, np.nan) for name in QUANTITIES}
     for cell, group in groups.items():
         for name in values.keys() & QUANTITIES.keys():
             taken = values[name][group[-1:] if repeats == "last" else group]
             taken = taken[np.isfinite(taken)]
-            found[name][cell] = taken.mean() if taken.size else np.nan
-    empty = sum(not np.isfinite(found["length"][cell]) for cell in groups)
+            arrays[name][cell] = taken.mean() if taken.size else np.nan
+    empty = sum(not np.isfinite(arrays["length"][cell]) for cell in groups)
     missing = {"empty": int(empty), "no line": shape[0] * shape[1] - len(groups)}
     return Readings(
         names["station"],
         names["target"],
-        **found,
+        **arrays,
         missing={why: count for why, count in missing.items() if count},
         repeated=len(table.lines) - len(groups),
     )

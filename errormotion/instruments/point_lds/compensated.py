@@ -118,12 +118,12 @@ class CompensatedSensor:
         """Yield blocks of readings of a surface with a known tilt, until the caller stops; see `read`."""
         for samples in self.sensor.stream(block):  # type: ignore[attr-defined]
             known = {field.name: getattr(samples, field.name) for field in fields(Samples)}
-            found = self._compensate(samples.values, inclination, rotation)
+            compensated = self._compensate(samples.values, inclination, rotation)
             yield CompensatedSamples(
-                **{**known, "values": found.value},
-                raw=found.raw,
-                uncertainty=found.uncertainty,
-                jacobian=found.jacobian,
+                **{**known, "values": compensated.value},
+                raw=compensated.raw,
+                uncertainty=compensated.uncertainty,
+                jacobian=compensated.jacobian,
             )
 
     def _compensate(self, reading: float | Array, inclination: float, rotation: float) -> Compensated:
@@ -135,14 +135,16 @@ class CompensatedSensor:
                 f"Expected finite angles of the surface; found inclination {inclination}, rotation {rotation} rad",
                 code="sensor.surface.angle",
             )
-        found = self.calibration.compensate(reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate)
+        compensated = self.calibration.compensate(
+            reading, q, mid_range=self.sensor.mid_range, extrapolate=self.extrapolate
+        )
         shape = np.shape(reading)  # one tilt for all of them adds no dimension
         return replace(
-            found,
-            raw=found.raw.reshape(shape),
-            value=found.value.reshape(shape),
-            uncertainty=found.uncertainty.reshape(shape),
-            jacobian=found.jacobian.reshape(*shape, -1),
+            compensated,
+            raw=compensated.raw.reshape(shape),
+            value=compensated.value.reshape(shape),
+            uncertainty=compensated.uncertainty.reshape(shape),
+            jacobian=compensated.jacobian.reshape(*shape, -1),
         )
 
 

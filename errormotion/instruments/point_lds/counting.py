@@ -169,11 +169,11 @@ class CountingDriver(Driver):
         )
 
 
-def check_range(stated: float | None, found: float, where: str, remedy: str) -> None:
+def check_range(stated: float | None, actual: float, where: str, remedy: str) -> None:
     """Compare the range of the settings, m, with that of the controller; InstrumentError if they differ."""
-    if stated is not None and abs(stated - found) > RANGE_TOLERANCE * found:
+    if stated is not None and abs(stated - actual) > RANGE_TOLERANCE * actual:
         raise InstrumentError(
-            f"The setting 'measuring_range' is {stated * 1e3:g} mm; the controller states {found * 1e3:g} mm{where}. "
+            f"The setting 'measuring_range' is {stated * 1e3:g} mm; the controller states {actual * 1e3:g} mm{where}. "
             f"Change the setting, or {remedy}",
             code="sensor.range.differs",
         )

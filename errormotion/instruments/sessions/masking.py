@@ -57,21 +57,21 @@ def mask(path: Path, words: Sequence[str], early: Mapping[Path, int]) -> int:
     number ``early`` states for each file. Checksums of the protocol are not corrected: replay the masked recording to
     check that the driver accepts it.
     """
-    found = 0
+    total = 0
     for part in parts_of(path):
         frames, first = read_recording(part)[1], early.get(part, 0)
         for word in words:
             for old, new in _forms(word):
                 frames, count = _replaced(frames, old, new)
-                found += count
+                total += count
             for old, new in _integers(word):
                 changed, count = _replaced(frames[:first], old, new)
                 frames = [*changed, *frames[first:]]
-                found += count
+                total += count
         rewrite(part, frames)
     if (note := read_note(path)) is not None:
         add_note(path, _masked_note(note, words))
-    return found
+    return total
 
 
 def holds(path: Path, words: Sequence[str]) -> bool:

@@ -160,19 +160,19 @@ def repeat(driver: Any, session: Mapping[str, Any]) -> Session:
 
 def differences(recorded: Mapping[str, Any], again: Session) -> list[str]:
     """Return the differences between a repeated session and the recorded one, one sentence for each; empty: none."""
-    found: list[str] = []
+    texts: list[str] = []
     if again.step != recorded.get("step") or not _same_error(recorded, again):
         before = f"{recorded.get('error')} in the step '{recorded.get('step')}'" if recorded.get("step") else "no error"
         now = f"{again.error} in the step '{again.step}': {again.message}" if again.step else "no error"
-        found.append(f"expected {before}; found {now}")
+        texts.append(f"expected {before}; found {now}")
     identity, identity_again = (_core(each) for each in (recorded.get("identity"), again.identity))
     if identity != identity_again:
-        found.append(f"expected the identity {identity}; found {identity_again}")
+        texts.append(f"expected the identity {identity}; found {identity_again}")
     for name, summary in (("readings", again.readings), ("stream", again.stream)):
         before_, now_ = recorded.get(name), _as_json(summary)
         if before_ != now_:
-            found.append(f"the {name} differ: expected {before_}; found {now_}")
-    return found
+            texts.append(f"the {name} differ: expected {before_}; found {now_}")
+    return texts
 
 
 def _core(identity: Any) -> dict[str, Any]:

@@ -74,8 +74,8 @@ class FiveSensorFrame(Openable):
     @property
     def encoding(self) -> dict[str, Any]:
         """Encoding that stores samples without loss, where all sensors have the same one; else empty."""
-        found = [dict(getattr(sensor, "encoding", {})) for sensor in self._open_sensors().values()]
-        return found[0] if all(each == found[0] for each in found) else {}
+        encodings = [dict(getattr(sensor, "encoding", {})) for sensor in self._open_sensors().values()]
+        return encodings[0] if all(each == encodings[0] for each in encodings) else {}
 
     @property
     def addresses(self) -> dict[str, str]:

@@ -101,18 +101,18 @@ def check_configuration(text: str) -> None:
     ProtocolError
         The text is not a configuration.
     """
-    found = _CONFIGURATION.fullmatch(text)
-    if found is None:
+    match = _CONFIGURATION.fullmatch(text)
+    if match is None:
         raise ProtocolError(f"Expected a configuration such as '100600'; found '{text}'", code="protocol.reply.form")
-    type_code, data_format = int(found[1], 16), int(found[2], 16)
+    type_code, data_format = int(match[1], 16), int(match[2], 16)
     if type_code <= _LAST_ELECTRICAL_TYPE:
         raise InstrumentError(
-            f"The module is set to input range {found[1]}, a voltage or current; set it to the type of the sensors",
+            f"The module is set to input range {match[1]}, a voltage or current; set it to the type of the sensors",
             code="thermometer.range.other",
         )
     if form := _FORMATS.get(data_format & 3):
         raise InstrumentError(
-            f"The module reports {form} (data format {found[2]}); expected engineering units: set bits 1 and 0 of the "
+            f"The module reports {form} (data format {match[2]}); expected engineering units: set bits 1 and 0 of the "
             "data format to 00",
             code="thermometer.format.other",
         )
@@ -170,13 +170,14 @@ class DconTemperature(LineThermometer):
         self.settings = settings
 
     def _measure(self) -> dict[str, tuple[float, str]]:
-        found = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
-        if len(found) < len(self.channels):
+        temperatures = parse_temperatures(">" + self._query(f"#{self._unit}", ">"))
+        if len(temperatures) < len(self.channels):
             raise ProtocolError(
-                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); found {len(found)}",
+                f"Expected at least {len(self.channels)} temperatures ({', '.join(self.channels)}); "
+                f"found {len(temperatures)}",
                 code="thermometer.channels.too_few",
             )
-        readings = dict(zip(self.channels, found, strict=False))
+        readings = dict(zip(self.channels, temperatures, strict=False))
         if disabled := [name for name, value in readings.items() if value is None]:
             raise ProtocolError(
                 f"The channels of {', '.join(disabled)} are disabled in the module; enable or omit them",

@@ -94,12 +94,12 @@ class Thermometer(Driver):
             No answer or an invalid one; after a lost connection the next call connects again.
         """
         try:
-            found = self._measure()
+            temperatures = self._measure()
         except InstrumentError:
             self.flags = dict.fromkeys(self.channels, NO_ANSWER)
             raise
-        self.flags = {name: flag for name, (_, flag) in found.items()}
-        return {name: math.nan if flag else value for name, (value, flag) in found.items()}
+        self.flags = {name: flag for name, (_, flag) in temperatures.items()}
+        return {name: math.nan if flag else value for name, (value, flag) in temperatures.items()}
 
     def _measure(self) -> Mapping[str, tuple[float, str]]:
         """Return temperature (degC) and flag of each channel, in their order."""

@@ -155,7 +155,7 @@ class Toucher:
     def _slow(self, fast: float, start: Array, direction: Array, length: float) -> list[tuple[float, float]]:
         """Return distance from the start (m) and time (s) of each slow trip; empty without a trip."""
         limit = start + min(fast + self._how.margin, length) * direction
-        found: list[tuple[float, float]] = []
+        contacts: list[tuple[float, float]] = []
 
         distance = fast
         for _ in range(self._how.repeats):
@@ -165,8 +165,8 @@ class Toucher:
             if tripped is None:
                 return []
             distance = self._along(tripped, start, direction, length)
-            found.append((distance, float(tripped["time"])))
-        return found
+            contacts.append((distance, float(tripped["time"])))
+        return contacts
 
     def _evaluate(self, fast: float, slow: Sequence[tuple[float, float]], start: Array, direction: Array) -> Contact:
         """Return the contact of slow touches, with the tip back at the start."""

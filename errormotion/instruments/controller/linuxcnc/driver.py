@@ -423,12 +423,12 @@ def read_token(path: Path, address: str) -> str:
     try:
         handle = open_itself(path, os.O_RDONLY)
         with os.fdopen(handle, encoding="ascii", errors="replace") as file:
-            found = os.fstat(handle)
-            owned = os.geteuid() in (0, found.st_uid)
-            if not (stat.S_ISREG(found.st_mode) and owned) or found.st_mode & 0o077:
+            status = os.fstat(handle)
+            owned = os.geteuid() in (0, status.st_uid)
+            if not (stat.S_ISREG(status.st_mode) and owned) or status.st_mode & 0o077:
                 raise InstrumentError(
                     f"{address}: expected a token in {path} that only this user can read; found the mode "
-                    f"{stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}. Use 'chmod 600 {path}', and a new "
+                    f"{stat.S_IMODE(status.st_mode):04o} of user {status.st_uid}. Use 'chmod 600 {path}', and a new "
                     "token if others have seen it",
                     code="linuxcnc.token.not_private",
                 )

@@ -135,7 +135,7 @@ def _add(
         return
     for sub_type in sub_types:
         for kind in types:
-            found = [
+            items = [
                 item
                 for item in device.items.values()
                 if item.type == kind
@@ -144,17 +144,17 @@ def _add(
                 and item.representation in _SINGLE_VALUES
                 and fits(item)
             ]
-            best = min((_rank(item) for item in found), default=0)
-            found = [item for item in found if _rank(item) == best]
-            if len(found) > 1:
-                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in found[:_MAX_NAMED])
+            best = min((_rank(item) for item in items), default=0)
+            items = [item for item in items if _rank(item) == best]
+            if len(items) > 1:
+                names = ", ".join(f"{item.id} ({item.component} {item.component_name})" for item in items[:_MAX_NAMED])
                 choice.unclear[key] = (
                     f"Several data items report '{key}': {names}. It is unknown until the settings state which one: "
-                    f'items = {{ "{key}" = "{found[0].id}" }}'
+                    f'items = {{ "{key}" = "{items[0].id}" }}'
                 )
                 return
-            if found:
-                choice.items[key] = found[0]
+            if items:
+                choice.items[key] = items[0]
                 return
 
 

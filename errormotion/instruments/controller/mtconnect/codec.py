@@ -172,15 +172,15 @@ class Observation:
         """Return the values of a list such as ``1.5 2 3`` times ``scale``; one NaN if it is unavailable."""
         if self.value.upper() == UNAVAILABLE:
             return [math.nan]
-        found = []
+        numbers = []
         for word in self.value.split():
             if not _NUMBER.fullmatch(word) or math.isinf(float(word)):
                 raise ProtocolError(
                     f"The data item '{self.item}': expected a number; found '{self.value[:40]}'",
                     code="protocol.mtconnect.number",
                 )
-            found.append(float(word) * scale)
-        return found or [math.nan]
+            numbers.append(float(word) * scale)
+        return numbers or [math.nan]
 
 
 @dataclass(frozen=True)
@@ -359,9 +359,9 @@ def _row(entry: Element) -> str:
 
 
 def _errors(root: Element) -> dict[str, str]:
-    found = {each.get("errorCode"): _words(each) for each in root.walk()}
-    found.pop("", None)
-    return found or {"UNKNOWN": "error without a code"}
+    errors = {each.get("errorCode"): _words(each) for each in root.walk()}
+    errors.pop("", None)
+    return errors or {"UNKNOWN": "error without a code"}
 
 
 def _words(element: Element) -> str:

@@ -78,14 +78,14 @@ def _number(
 
 def _words(key: str, observation: Observation, item: DataItem, reasons: dict[str, str]) -> list[float]:
     """Return the numbers of an observation in SI, each NaN where it is none; at least one."""
-    found = []
+    words = []
     for word in observation.value.split() or [UNAVAILABLE]:
         try:
-            found.append(replace(observation, value=word).number(item.scale))
+            words.append(replace(observation, value=word).number(item.scale))
         except ProtocolError as error:
             reasons[key] = str(error)
-            found.append(math.nan)
-    return found
+            words.append(math.nan)
+    return words
 
 
 def _position(

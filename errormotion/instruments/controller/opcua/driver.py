@@ -152,12 +152,12 @@ class OpcUa(Driver):
         return list(answers)
 
     def _browse(self, node: str) -> list[Mapping[str, Any]]:
-        found = request(self.transport, {"browse": node})
-        if not isinstance(found, list) or not all(_is_child(each) for each in found):
+        nodes = request(self.transport, {"browse": node})
+        if not isinstance(nodes, list) or not all(_is_child(each) for each in nodes):
             raise ProtocolError(
-                f"{self.address}: expected the children of {node}; found {str(found)[:80]}", code="protocol.opc.form"
+                f"{self.address}: expected the children of {node}; found {str(nodes)[:80]}", code="protocol.opc.form"
             )
-        return found
+        return nodes
 
     def _connect(self) -> Transport:
         settings = self.settings

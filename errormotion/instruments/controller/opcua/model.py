@@ -56,8 +56,8 @@ def interface(namespaces: Sequence[str], browse: Browse) -> str:
     if NAMESPACE not in namespaces:
         return ""
     index = namespaces.index(NAMESPACE)
-    found = [each["id"] for each in browse(OBJECTS) if each["name"] == "CncInterface" and each["namespace"] == index]
-    return found[0] if found else ""
+    ids = [each["id"] for each in browse(OBJECTS) if each["name"] == "CncInterface" and each["namespace"] == index]
+    return ids[0] if ids else ""
 
 
 def quantities(root: str, browse: Browse, settings: OpcUaSettings) -> tuple[dict[str, str], dict[str, str]]:
@@ -72,21 +72,21 @@ def quantities(root: str, browse: Browse, settings: OpcUaSettings) -> tuple[dict
         none.
     """
     parts = children(browse, root)
-    found: dict[str, str] = {}
+    nodes: dict[str, str] = {}
     units: dict[str, str] = {}
     axes = children(browse, parts.get("CncAxisList", ""))
     for axis, name in zip("XYZ", settings.axes, strict=True):
         axis_parts = children(browse, _one("axis", axes, name))
         position = children(browse, axis_parts.get(f"Pos{settings.feedback.capitalize()}", ""))
         both = {"ActPos": f"position.{axis}", "CmdPos": f"commanded_position.{axis}"}
-        found |= _present(position, both) | _present(axis_parts, {"IsReferenced": f"{HOMED}{axis}"})
+        nodes |= _present(position, both) | _present(axis_parts, {"IsReferenced": f"{HOMED}{axis}"})
         if UNIT in position:
             units |= dict.fromkeys(both.values(), position[UNIT])
     spindle = children(browse, _one("spindle", children(browse, parts.get("CncSpindleList", "")), settings.spindle))
-    found |= _present(spindle, {"ActSpeed": "spindle_speed", "ActLoad": "spindle_load"})
+    nodes |= _present(spindle, {"ActSpeed": "spindle_speed", "ActLoad": "spindle_load"})
     channel = children(browse, _one("channel", children(browse, parts.get("CncChannelList", "")), settings.channel))
     names = {"ActFeedrate": "feed", "ActOperationMode": "mode", "ActProgramName": "program"}
-    return found | _present(channel, names | {"ActProgramStatus": "execution"}), units
+    return nodes | _present(channel, names | {"ActProgramStatus": "execution"}), units
 
 
 def children(browse: Browse, node: str) -> dict[str, str]:
@@ -140,17 +140,17 @@ def _present(parts: Mapping[str, str], names: Mapping[str, str]) -> dict[str, st
     return {key: parts[name] for name, key in names.items() if name in parts}
 
 
-def _one(what: str, found: Mapping[str, str], name: str) -> str:
+def _one(what: str, nodes: Mapping[str, str], name: str) -> str:
     """Return the node with a name; without a name the only node, or an empty id if there is none."""
     if name:
-        if name in found or not found:
-            return found.get(name, "")
+        if name in nodes or not nodes:
+            return nodes.get(name, "")
         raise InstrumentError(
-            f"The server has no {what} '{name}'; it has {', '.join(sorted(found))}", code="opc.object.unknown"
+            f"The server has no {what} '{name}'; it has {', '.join(sorted(nodes))}", code="opc.object.unknown"
         )
-    if len(found) > 1:
+    if len(nodes) > 1:
         raise InstrumentError(
-            f"The server has several: {what} {', '.join(sorted(found))}; state one in the settings",
+            f"The server has several: {what} {', '.join(sorted(nodes))}; state one in the settings",
             code="opc.object.ambiguous",
         )
-    return next(iter(found.values()), "")
+    return next(iter(nodes.values()), "")

@@ -161,14 +161,16 @@ def parse_line(line: bytes, keys: Keys = Keys()) -> Command | list[Observed]:
     several = keys.conditions | keys.messages | keys.series
     simple = fields[1] in keys.known and not several & set(fields)
     try:
-        found = list(_observed(fields[1:], time, keys, text))
+        observations = list(_observed(fields[1:], time, keys, text))
     except ProtocolError:
         if not simple or len(fields) % 2:
             raise
         return list(_between_known(fields[1:], time, keys.known))
-    if simple and any(each.key not in keys.known and each.value in keys.known for each in found):  # shifted by one
+    if simple and any(
+        each.key not in keys.known and each.value in keys.known for each in observations
+    ):  # shifted by one
         return list(_between_known(fields[1:], time, keys.known))
-    return found
+    return observations
 
 
 def split_fields(text: str) -> list[str]:
@@ -184,17 +186,17 @@ def split_fields(text: str) -> list[str]:
         raise ProtocolError(
             f"Expected at most {MAX_FIELDS} fields; the line starts '{text[:60]}'", code="protocol.shdr.line"
         )
-    found: list[str] = []
+    fields: list[str] = []
     quoted: list[str] = []
     for part in parts:
         if quoted or (part.lstrip().startswith('"') and part.endswith("\\")):
             quoted.append(part)
             if not part.endswith("\\"):
-                found.append(_unquoted("|".join(each.removesuffix("\\") for each in quoted)))
+                fields.append(_unquoted("|".join(each.removesuffix("\\") for each in quoted)))
                 quoted = []
         else:
-            found.append(_unquoted(part))
-    return [*found, *(each.strip() for each in quoted)]
+            fields.append(_unquoted(part))
+    return [*fields, *(each.strip() for each in quoted)]
 
 
 def _unquoted(part: str) -> str:
@@ -234,12 +236,12 @@ def parse_numbers(text: str) -> list[float]:
     """
     if text.upper() == UNAVAILABLE:
         return [math.nan]
-    found = []
+    numbers = []
     for word in text.partition(":")[0].split():
         if not _NUMBER.fullmatch(word) or math.isinf(float(word)):
             raise ProtocolError(f"Expected a number; found '{text[:40]}'", code="protocol.shdr.number")
-        found.append(float(word))
-    return found or [math.nan]
+        numbers.append(float(word))
+    return numbers or [math.nan]
 
 
 def _observed(fields: list[str], time: float, keys: Keys, text: str) -> Iterator[Observed]:

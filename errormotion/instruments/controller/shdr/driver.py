@@ -224,15 +224,15 @@ class Shdr(Driver):
         wrong: ProtocolError | None = None
         for line in self._lines.feed(data):
             try:
-                found = parse_line(line, self._keys)
+                observations = parse_line(line, self._keys)
             except ProtocolError as error:
                 self.malformed += 1
                 wrong = wrong or error
                 continue
-            if isinstance(found, Command):
-                answered = self._command(found) or answered
+            if isinstance(observations, Command):
+                answered = self._command(observations) or answered
             else:
-                for observed in filter(None, map(self._of_device, found)):
+                for observed in filter(None, map(self._of_device, observations)):
                     self._memory.store(observed)
                     if observed.doubt:
                         self.malformed += 1

@@ -73,14 +73,14 @@ class Memory:
         observed = self.values.get(key)
         if observed is None:
             return [math.nan]
-        found = []
+        numbers = []
         for word in observed.value.partition(":")[0].split() or [UNAVAILABLE]:
             try:
-                found += parse_numbers(word)
+                numbers += parse_numbers(word)
             except ProtocolError as error:
                 reasons[key] = str(error)
-                found.append(math.nan)
-        return found
+                numbers.append(math.nan)
+        return numbers
 
     def reported(self, level: str) -> list[str]:
         """Return the texts of the conditions of a level, such as ``system 1104: overtravel``."""

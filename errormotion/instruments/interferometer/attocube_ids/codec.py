@@ -99,10 +99,10 @@ def in_family(method: str, family: str) -> str:
 
 def request(method: str, number: int, *parameters: bool | int | str) -> bytes:
     """Return a request, in the form of the manufacturer's client: without a line end."""
-    found: dict[str, Any] = {"jsonrpc": "2.0", "method": method, "id": number, "api": API}
+    message: dict[str, Any] = {"jsonrpc": "2.0", "method": method, "id": number, "api": API}
     if parameters:
-        found["params"] = list(parameters)
-    return json.dumps(found).encode("ascii")
+        message["params"] = list(parameters)
+    return json.dumps(message).encode("ascii")
 
 
 def reply(line: bytes) -> Reply:
@@ -118,16 +118,16 @@ def reply(line: bytes) -> Reply:
             f"A reply of {len(line)} bytes; expected at most {MAX_REPLY}", code="protocol.reply.too_long"
         )
     try:
-        found = json.loads(line, parse_constant=_refuse)
+        message = json.loads(line, parse_constant=_refuse)
     except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or found.get("jsonrpc") != "2.0":
+        message = None
+    if not isinstance(message, dict) or message.get("jsonrpc") != "2.0":
         raise ProtocolError(
             f'Expected a reply such as \'{{"jsonrpc":"2.0","id":1,"result":[0]}}\'; found {line[:60]!r}. Check '
             "that the address is port 9090 of an IDS3010",
             code="protocol.reply.form",
         )
-    number, result, error = found.get("id"), found.get("result"), found.get("error")
+    number, result, error = message.get("id"), message.get("result"), message.get("error")
     if not (number is None or (isinstance(number, int) and not isinstance(number, bool))):
         raise ProtocolError(
             f"The number of a reply: expected an integer; found {str(number)[:40]!r}", code="protocol.reply.number_form"

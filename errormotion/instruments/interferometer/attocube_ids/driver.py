@@ -75,11 +75,11 @@ class AttocubeIds(Driver):
 
     def _call(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to one request, whatever its code; late replies to earlier requests are discarded."""
-        found = self._reply(method, *parameters)
-        if found.refusal:
+        result = self._reply(method, *parameters)
+        if result.refusal:
             method = codec.in_family(method, self._family)
-            raise InstrumentError(f"{self.address} refuses '{method}': {found.refusal}", code="instrument.refused")
-        return found
+            raise InstrumentError(f"{self.address} refuses '{method}': {result.refusal}", code="instrument.refused")
+        return result
 
     def _reply(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to one request, also one that states that it was not executed."""
@@ -87,8 +87,8 @@ class AttocubeIds(Driver):
         method = codec.in_family(method, self._family)
 
         def mine(text: bytes) -> codec.Reply | None:
-            found = codec.reply(text)
-            return found if found.number == self._number or (found.number is None and found.refusal) else None
+            reply = codec.reply(text)
+            return reply if reply.number == self._number or (reply.number is None and reply.refusal) else None
 
         with self.exchange() as line:
             line.write(codec.request(method, self._number, *parameters))
@@ -96,12 +96,12 @@ class AttocubeIds(Driver):
 
     def _request(self, method: str, *parameters: bool | int | str) -> codec.Reply:
         """Return the reply to a request that must succeed."""
-        found = self._call(method, *parameters)
-        if found.code:
+        result = self._call(method, *parameters)
+        if result.code:
             raise InstrumentError(
-                f"{self.address} refuses '{method}': {self._meaning(found.code)}", code="instrument.refused"
+                f"{self.address} refuses '{method}': {self._meaning(result.code)}", code="instrument.refused"
             )
-        return found
+        return result
 
     def _meaning(self, code: int) -> str:
         """Return number and text of an error, the text as the device states it."""
@@ -133,14 +133,14 @@ class AttocubeIds(Driver):
         """Return the type of the device, in the first family of functions that it knows; use this one from now on."""
         refusals = []
         for self._family in codec.FAMILIES:
-            found = self._reply(codec.SYSTEM + "getDeviceType")
-            if not found.refusal:
-                if found.code:
+            reply = self._reply(codec.SYSTEM + "getDeviceType")
+            if not reply.refusal:
+                if reply.code:
                     raise InstrumentError(
-                        f"{self.address} refuses its type: {self._meaning(found.code)}", code="instrument.refused"
+                        f"{self.address} refuses its type: {self._meaning(reply.code)}", code="instrument.refused"
                     )
-                return found.text(0)
-            refusals.append(f"'{codec.in_family(codec.SYSTEM, self._family)}getDeviceType': {found.refusal}")
+                return reply.text(0)
+            refusals.append(f"'{codec.in_family(codec.SYSTEM, self._family)}getDeviceType': {reply.refusal}")
         raise InstrumentError(f"{self.address} refuses {'; '.join(refusals)}", code="instrument.refused")
 
     def _passes(self) -> str:
@@ -246,23 +246,23 @@ class AttocubeIds(Driver):
 
     def _displacements(self) -> dict[int, float]:
         """Return the displacements that the device reports by axis, m; NaN for an axis that has lost its count."""
-        found = self._call(codec.DISPLACEMENT + "getAxesDisplacement")
-        if found.code == 0:
-            counts = {axis: found.length(axis - 1) for axis in self.settings.axes}
+        values = self._call(codec.DISPLACEMENT + "getAxesDisplacement")
+        if values.code == 0:
+            counts = {axis: values.length(axis - 1) for axis in self.settings.axes}
         else:  # one warning applies to three axes, also to those that are not used
             counts = {axis: self._displacement(axis) for axis in self.settings.axes}
         return {axis: math.nan if axis in self._lost else count for axis, count in counts.items()}
 
     def _displacement(self, axis: int) -> float:
-        found = self._call(codec.DISPLACEMENT + "getAxisDisplacement", axis - 1)
-        if found.code == 0:
-            return found.length(0)
+        values = self._call(codec.DISPLACEMENT + "getAxisDisplacement", axis - 1)
+        if values.code == 0:
+            return values.length(0)
         if (mode := self._mode()) != RUNNING:
             raise InstrumentError(
                 f"{self.address} has stopped measuring; its mode is '{mode}'", code="interferometer.not_measuring"
             )
         if axis not in self._lost:
-            self._lost[axis] = f"count lost: {self._meaning(found.code)}"
+            self._lost[axis] = f"count lost: {self._meaning(values.code)}"
         return math.nan
 
     def zero(self) -> None:

@@ -216,22 +216,27 @@ class LeicaEmScon(EmSconSession):
 
         radius = self.settings.search_radius
         always_moves = goal is not None and self.settings.tracker == "AT4xx"
-        found = Measurement(reason="beam broken", dead_path=self.dead_path)
+        measurement = Measurement(reason="beam broken", dead_path=self.dead_path)
         for attempt in range(self.settings.reacquire + 1):
             try:
                 if self._link.broken and not always_moves:
                     if attempt == self.settings.reacquire == 0:
                         break
                     self._reacquire(goal)
-                found = self._measure(goal if always_moves else None)
-                if found.valid and goal is not None and not always_moves and not results.is_near(found, goal, radius):
+                measurement = self._measure(goal if always_moves else None)
+                if (
+                    measurement.valid
+                    and goal is not None
+                    and not always_moves
+                    and not results.is_near(measurement, goal, radius)
+                ):
                     self._go(goal)
-                    found = self._measure(None)
+                    measurement = self._measure(None)
             except BeamBrokenError as error:
-                found = Measurement(reason=str(error), dead_path=self.dead_path)
-            if found.valid:
+                measurement = Measurement(reason=str(error), dead_path=self.dead_path)
+            if measurement.valid:
                 break
-        return found
+        return measurement
 
     def read(self) -> float:
         """Return the present distance, m; NaN if the beam remains broken."""

@@ -136,14 +136,14 @@ def reply(line: bytes) -> Reply:
             f"A GeoCOM reply of {len(line)} bytes; expected at most {MAX_REPLY}", code="protocol.reply.too_long"
         )
     text = line.decode("latin-1").rstrip("\r\n").lstrip("\n")
-    found = _REPLY.fullmatch(text)
-    if found is None:
+    match = _REPLY.fullmatch(text)
+    if match is None:
         raise ProtocolError(
             f"Expected a GeoCOM reply, '%R1P,code,number:code,...'; found {text[:60]!r}. Check that the interface of "
             "the station is set to GeoCOM",
             code="protocol.reply.form",
         )
-    communication, transaction, code, values = found.groups()
+    communication, transaction, code, values = match.groups()
     return Reply(int(communication), int(transaction or 0), int(code), _fields(values))
 
 
@@ -152,22 +152,22 @@ def _fields(values: str | None) -> tuple[str, ...]:
         return ()
     fields, start = [], 0
     while True:
-        found = _FIELD.match(values, start)
-        end = start if found is None else found.end()
-        if found is None or (end < len(values) and values[end] != ","):
+        match = _FIELD.match(values, start)
+        end = start if match is None else match.end()
+        if match is None or (end < len(values) and values[end] != ","):
             raise ProtocolError(
                 f"A GeoCOM reply has an incomplete value: {values[start : start + 40]!r}", code="protocol.reply.form"
             )
-        fields.append(found[0])
+        fields.append(match[0])
         if end == len(values):
             return tuple(fields)
         start = end + 1
 
 
-def check(call: int, found: Reply) -> None:
+def check(call: int, answer: Reply) -> None:
     """Raise InstrumentError if the communication failed: the call was not executed."""
-    if found.communication:
+    if answer.communication:
         raise InstrumentError(
-            f"GeoCOM call {codes.name(call)} failed: code {found.communication}, {codes.text(found.communication)}",
+            f"GeoCOM call {codes.name(call)} failed: code {answer.communication}, {codes.text(answer.communication)}",
             code="instrument.refused",
         )

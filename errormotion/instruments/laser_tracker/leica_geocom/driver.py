@@ -83,12 +83,12 @@ class LeicaGeoCom(Driver):
         try:
             with self.exchange() as line:
                 line.write((b"\n" if self._clear else b"") + codec.request(call, number, *parameters))
-                found = self._reply(line, number, codes.name(call), limit)
+                reply = self._reply(line, number, codes.name(call), limit)
         except InstrumentError:
             self._clear = True
             raise
         self._clear = False
-        return found
+        return reply
 
     def _reply(self, line: Transport, number: int, call: str, limit: float) -> codec.Reply:
         """Return the reply with a number; late replies, and data that the station records in between, are discarded."""
@@ -108,29 +108,29 @@ class LeicaGeoCom(Driver):
             if codec.is_gsi(text):
                 recorded += 1
                 continue
-            found = codec.reply(text)
-            if found.transaction == number:
-                return found
+            reply = codec.reply(text)
+            if reply.transaction == number:
+                return reply
             others += 1
 
     def _request(self, call: int, *parameters: int | float, limit: float | None = None) -> codec.Reply:
         """Return the reply to a call that must succeed."""
-        found = self._call(call, *parameters, limit=limit)
-        codec.check(call, found)
-        if found.code != codes.OK:
+        reply = self._call(call, *parameters, limit=limit)
+        codec.check(call, reply)
+        if reply.code != codes.OK:
             raise InstrumentError(
-                f"{self.address} refuses GeoCOM call {codes.name(call)}: code {found.code}, {codes.text(found.code)}",
+                f"{self.address} refuses GeoCOM call {codes.name(call)}: code {reply.code}, {codes.text(reply.code)}",
                 code="instrument.refused",
             )
-        return found
+        return reply
 
     def _optional(self, call: int) -> codec.Reply | None:
         """Return the reply to a call that not all stations have; None if it is unavailable or fails."""
-        found = self._call(call)
-        if found.communication in codes.UNAVAILABLE:
+        reply = self._call(call)
+        if reply.communication in codes.UNAVAILABLE:
             return None
-        codec.check(call, found)
-        return found if found.code == codes.OK else None
+        codec.check(call, reply)
+        return reply if reply.code == codes.OK else None
 
     # ------------------------------------------------------------------ identity and state
 
@@ -165,8 +165,8 @@ class LeicaGeoCom(Driver):
 
     def environment(self) -> Environment:
         """Return the conditions of the air for which the station corrects distances: degC, Pa, %."""
-        found = self._request(codes.GET_AIR)
-        pressure, dry, wet = HECTOPASCAL * found.number(1), found.number(2), found.number(3)
+        values = self._request(codes.GET_AIR)
+        pressure, dry, wet = HECTOPASCAL * values.number(1), values.number(2), values.number(3)
         return Environment(dry, pressure, air.humidity(dry, wet, pressure))
 
     def set_environment(self, environment: Environment) -> None:
@@ -198,13 +198,13 @@ class LeicaGeoCom(Driver):
     def direction(self) -> tuple[float, float]:
         """Return the direction of the line of sight: azimuth and zenith angle, rad."""
         call = codes.GET_ANGLES
-        found = self._call(call, codes.INCLINATION[self.settings.inclination])
-        codec.check(call, found)
-        if found.code not in (codes.OK, *codes.WARNINGS):
+        reply = self._call(call, codes.INCLINATION[self.settings.inclination])
+        codec.check(call, reply)
+        if reply.code not in (codes.OK, *codes.WARNINGS):
             raise InstrumentError(
-                f"{self.address} has no angles: code {found.code}, {codes.text(found.code)}", code="tracker.no_angles"
+                f"{self.address} has no angles: code {reply.code}, {codes.text(reply.code)}", code="tracker.no_angles"
             )
-        return math.remainder(-found.number(0), math.tau), found.number(1)
+        return math.remainder(-reply.number(0), math.tau), reply.number(1)
 
     # ------------------------------------------------------------------ moving
 
@@ -246,14 +246,14 @@ class LeicaGeoCom(Driver):
             (codes.POSITION, (horizontal, zenith, 0, 0, 0)),
             (codes.FINE_ADJUST, (radius, radius, 0)),
         ):
-            found = self._call(call, *parameters, limit=limit)
-            codec.check(call, found)
-            if found.code in codes.NO_TARGET:
-                return f"code {found.code}, {codes.text(found.code)}"
-            if found.code != codes.OK:
+            reply = self._call(call, *parameters, limit=limit)
+            codec.check(call, reply)
+            if reply.code in codes.NO_TARGET:
+                return f"code {reply.code}, {codes.text(reply.code)}"
+            if reply.code != codes.OK:
                 raise InstrumentError(
-                    f"{self.address} refuses GeoCOM call {codes.name(call)}: code {found.code}, "
-                    f"{codes.text(found.code)}",
+                    f"{self.address} refuses GeoCOM call {codes.name(call)}: code {reply.code}, "
+                    f"{codes.text(reply.code)}",
                     code="instrument.refused",
                 )
         return ""
@@ -283,16 +283,16 @@ class LeicaGeoCom(Driver):
         inclination = codes.INCLINATION[self.settings.inclination]
         self._request(codes.DO_MEASURE, codes.MEASURE_CLEAR, inclination)
         self._request(codes.DO_MEASURE, codes.MEASURE_DEFAULT, inclination)
-        found = self._result(inclination)
-        if found.code not in (codes.OK, *codes.WARNINGS):
-            return Measurement(reason=f"code {found.code}, {codes.text(found.code)}")
-        horizontal, zenith, distance = (found.number(index) for index in range(3))
+        measurement = self._result(inclination)
+        if measurement.code not in (codes.OK, *codes.WARNINGS):
+            return Measurement(reason=f"code {measurement.code}, {codes.text(measurement.code)}")
+        horizontal, zenith, distance = (measurement.number(index) for index in range(3))
         if not distance > 0.0:
             return Measurement(reason="the station returned no distance")
-        if found.code != codes.OK:
-            if not self.warnings[found.code]:
-                log.warning("%s: code %d, %s", self.address, found.code, codes.text(found.code))
-            self.warnings[found.code] += 1
+        if measurement.code != codes.OK:
+            if not self.warnings[measurement.code]:
+                log.warning("%s: code %d, %s", self.address, measurement.code, codes.text(measurement.code))
+            self.warnings[measurement.code] += 1
         settings = self.settings
         return Measurement(
             distance,
@@ -308,15 +308,15 @@ class LeicaGeoCom(Driver):
         limit = self.settings.measuring_timeout
         deadline = time.monotonic() + limit
         while True:
-            found = self._call(
+            reply = self._call(
                 codes.GET_MEASUREMENT, round(1e3 * limit), inclination, limit=limit + self.settings.timeout
             )
-            codec.check(codes.GET_MEASUREMENT, found)
-            if found.code in (codes.OK, *codes.WARNINGS, *codes.NO_DISTANCE):
-                return found
-            if found.code != codes.BUSY or time.monotonic() > deadline:
+            codec.check(codes.GET_MEASUREMENT, reply)
+            if reply.code in (codes.OK, *codes.WARNINGS, *codes.NO_DISTANCE):
+                return reply
+            if reply.code != codes.BUSY or time.monotonic() > deadline:
                 raise InstrumentError(
-                    f"{self.address} does not measure: code {found.code}, {codes.text(found.code)}",
+                    f"{self.address} does not measure: code {reply.code}, {codes.text(reply.code)}",
                     code="instrument.refused",
                 )
             time.sleep(BUSY_INTERVAL)

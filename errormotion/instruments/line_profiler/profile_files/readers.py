@@ -306,14 +306,14 @@ def check_complete(path: Path) -> None:
                 f"{path} cannot be read: its header has no end. Check that the file is complete",
                 code="scans.file.damaged",
             )
-        found = stated
+        lines = stated
         if text:
-            found = _whole_lines(file)
+            lines = _whole_lines(file)
         elif width:
-            found = (path.stat().st_size - file.tell()) // width
-    if found < stated:
+            lines = (path.stat().st_size - file.tell()) // width
+    if lines < stated:
         raise InstrumentError(
-            f"{path} cannot be read: its header states {stated} points; found {found}", code="scans.file.damaged"
+            f"{path} cannot be read: its header states {stated} points; found {lines}", code="scans.file.damaged"
         )
 
 

@@ -126,13 +126,13 @@ def parse_fields(command: str, text: str) -> dict[str, str]:
     """Return the fields of an answer such as ``:ANO123,NAMabc``, by their three letters."""
     fields = {}
     for part in text.removeprefix(":").split(","):
-        found = _FIELD.fullmatch(part.strip())
-        if found is None:
+        match = _FIELD.fullmatch(part.strip())
+        if match is None:
             raise ProtocolError(
                 f"Expected fields such as 'NAM...' as the answer to '${command}'; found {text[:80]!r}",
                 code="protocol.reply.form",
             )
-        fields[found[1]] = found[2].strip()
+        fields[match[1]] = match[2].strip()
     return fields
 
 

@@ -237,17 +237,17 @@ class KeyenceLK(Driver):
 
     def _check_controller(self, output: str, unit: str, settings: LKSettings) -> None:
         request = f"SR,{DISPLAY_SETTING},{output}"
-        if (found := self._query(request)) != unit:
+        if (answer := self._query(request)) != unit:
             names = {str(display.number): name for name, display in DISPLAYS.items()}
             raise InstrumentError(
                 f"The setting 'display' is {settings.display}; the controller at {self.address} answers "
-                f"'{request}' with {names.get(found, found)!r}. Change one of them, or use set_up = \"set\"",
+                f"'{request}' with {names.get(answer, answer)!r}. Change one of them, or use set_up = \"set\"",
                 code="sensor.display.differs",
             )
         request = f"SR,{OFFSET_SETTING},{output}"
-        if set(found := self._query(request)) & set("123456789"):
+        if set(words := self._query(request)) & set("123456789"):
             raise InstrumentError(
-                f"The controller at {self.address} has an offset of {found}, so that 0 is not the middle of the range. "
+                f"The controller at {self.address} has an offset of {words}, so that 0 is not the middle of the range. "
                 'Clear it, or use set_up = "set"',
                 code="sensor.offset.set",
             )

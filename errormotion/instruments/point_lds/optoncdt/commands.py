@@ -60,9 +60,9 @@ def parse_answer(command: str, text: bytes) -> list[str]:
         )
     lines = [_without_echo(command, line.strip()) for line in words.splitlines()]
     for line in lines:
-        found = _ERROR.search(line.partition(":")[0])
-        if found:
-            reason = line[found.start(1) :]
+        match = _ERROR.search(line.partition(":")[0])
+        if match:
+            reason = line[match.start(1) :]
             hint = USER_HINT if "denied" in reason.lower() else ""
             raise RefusedCommandError(f"The sensor refuses '{command}': {reason}{hint}")
     return [line for line in lines if line]
@@ -103,13 +103,13 @@ def reported_range(facts: Mapping[str, str]) -> float | None:
     stated = facts.get("measuring range")
     if stated is None:
         return None
-    found = _RANGE.fullmatch(stated)
-    if not found or not 0 < float(found[1]) < 1e5:
+    match = _RANGE.fullmatch(stated)
+    if not match or not 0 < float(match[1]) < 1e5:
         raise ProtocolError(
             f"Expected a measuring range such as '20.00mm' from GETINFO; found '{stated[:40]}'",
             code="protocol.reply.range",
         )
-    return float(found[1]) * 1e-3
+    return float(match[1]) * 1e-3
 
 
 @dataclass(frozen=True)

@@ -66,11 +66,11 @@ class StreamDecoder:
         text = np.empty(buffer.size, dtype=np.uint8)
         used, n_values, n_text, self._after_text = kernels.split(buffer, values, text, self._after_text)
         self._rest = buffer[used:].tobytes()
-        found = np.concatenate([self._waiting, values[:n_values]])
-        self._waiting = found[max(found.size - self._look_ahead, 0) :]
-        raws = np.empty(found.size + 1, dtype=np.int32)
-        numbers = np.empty(found.size + 1, dtype=np.int64)
-        count = kernels.assemble(found, self._counter, self._counter_first, self._state, raws, numbers)
+        pending = np.concatenate([self._waiting, values[:n_values]])
+        self._waiting = pending[max(pending.size - self._look_ahead, 0) :]
+        raws = np.empty(pending.size + 1, dtype=np.int32)
+        numbers = np.empty(pending.size + 1, dtype=np.int64)
+        count = kernels.assemble(pending, self._counter, self._counter_first, self._state, raws, numbers)
         return Chunk(*self._convert(raws[:count], numbers[:count]), text[:n_text].tobytes())
 
     def _convert(self, raws: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any]) -> tuple[Any, Any]:

@@ -59,10 +59,10 @@ class SimulatedReader:
 
     def _run(self) -> None:
         while not self._ended.wait(INTERVAL):
-            found = self._content()
-            if found.get("schema") == SCHEMA and found["number"] != self._number:
-                self._number = found["number"]
-                self.machine.order([found[axis] for axis in "XYZ"])
+            content = self._content()
+            if content.get("schema") == SCHEMA and content["number"] != self._number:
+                self._number = content["number"]
+                self.machine.order([content[axis] for axis in "XYZ"])
             self._write()
 
     def _content(self) -> dict[str, Any]:

@@ -53,17 +53,17 @@ class SimulatedPlc(SimulatedModbusDevice):
         """Return the present registers, or the code of an exception."""
         if self.fault.hits("exception", self._answers):
             return FAILURE
-        found, plc = dict(self._words), self._map
+        registers, plc = dict(self._words), self._map
         if plc.owner is not None:
             if not self.machine.alive:
                 self._words.pop(plc.owner, None)
-            found[plc.owner] = self._words.get(plc.owner, 0)
+            registers[plc.owner] = self._words.get(plc.owner, 0)
         for first, value in zip(plc.applied or (), self.machine.offset, strict=True):
-            found.update(enumerate(plc.words(round(value / plc.scale)), start=first))
+            registers.update(enumerate(plc.words(round(value / plc.scale)), start=first))
         for register, text in ((plc.stop, self.machine.fault), (plc.busy, self.machine.busy)):
             if register is not None:
-                found[register] = int(bool(text))
-        return found
+                registers[register] = int(bool(text))
+        return registers
 
     def _written(self, registers: Mapping[int, int]) -> int:
         """Write registers; return 0, or the code of an exception. Registers that the PLC writes are refused."""

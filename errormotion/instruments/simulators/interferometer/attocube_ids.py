@@ -161,9 +161,9 @@ class SimulatedIds(SimulatedDevice):
     def answer(self, request: bytes) -> bytes:
         """Return the answer to one request."""
         try:
-            found = json.loads(request)
-            method, number, params = found["method"], found["id"], found.get("params") or []
-            old = self._old or "api" not in found
+            message = json.loads(request)
+            method, number, params = message["method"], message["id"], message.get("params") or []
+            old = self._old or "api" not in message
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
             error = {"code": -32700, "message": "Parse Error", "data": "SyntaxError: Unexpected token in JSON"}
             return _line({"jsonrpc": "2.0", "id": None, "error": error})

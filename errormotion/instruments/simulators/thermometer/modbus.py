@@ -87,7 +87,7 @@ class SimulatedModbus(SimulatedModbusDevice):
         """Return the present registers, or the code of an exception."""
         if self.fault.hits("exception", self._answers):
             return self._code
-        found: dict[int, int] = {}
+        registers: dict[int, int] = {}
         far = self.fault.hits("out_of_range", self._answers)
         readings = self._inputs.temperatures(self.world.time, self._rng)
         for i, (address, temperature) in enumerate(zip(self._settings.addresses, readings, strict=True)):
@@ -96,8 +96,8 @@ class SimulatedModbus(SimulatedModbusDevice):
                 words = self._no_sensor()
             elif i in self._inputs.shorted:
                 words = self._code_words(min(self._settings.shorted_codes, default=0))
-            found.update(enumerate(words, start=address))
-        return found
+            registers.update(enumerate(words, start=address))
+        return registers
 
     def _no_sensor(self) -> list[int]:
         if self._settings.type == "f32":

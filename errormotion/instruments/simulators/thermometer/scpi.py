@@ -164,7 +164,7 @@ class SimulatedScpiUnit(SimulatedDevice):
 
     def _commands(self) -> dict[str, Command]:
         """Return the commands: header, with the short form in capitals, to function and numbers of parameters."""
-        found: dict[str, Command] = {
+        commands: dict[str, Command] = {
             "*IDN?": (lambda _: IDENTITY, 0, 0),
             "*RST": (self._restart, 0, 0),
             "*CLS": (self._clear, 0, 0),
@@ -194,17 +194,17 @@ class SimulatedScpiUnit(SimulatedDevice):
             "DATA:POINts?": (lambda _: f"+{len(self._readings)}", 0, 0),
         }
         for name in (*WORDS, *NUMBERS):
-            found[name] = (partial(self._set, name), 1, 2)
-            found[f"{name}?"] = (partial(self._get, name), 0, 1)
+            commands[name] = (partial(self._set, name), 1, 2)
+            commands[f"{name}?"] = (partial(self._get, name), 0, 1)
         for name in _FIELDS:
-            found[f"FORMat:READing:{name}"] = (partial(self._set_field, name), 1, 1)
-            found[f"FORMat:READing:{name}?"] = (partial(self._get_field, name), 0, 0)
-        found["FORMat:READing:TIME:TYPE"] = (self._set_time_type, 1, 1)
-        found["FORMat:READing:TIME:TYPE?"] = (lambda _: "ABS" if self._absolute else "REL", 0, 0)
+            commands[f"FORMat:READing:{name}"] = (partial(self._set_field, name), 1, 1)
+            commands[f"FORMat:READing:{name}?"] = (partial(self._get_field, name), 0, 0)
+        commands["FORMat:READing:TIME:TYPE"] = (self._set_time_type, 1, 1)
+        commands["FORMat:READing:TIME:TYPE?"] = (lambda _: "ABS" if self._absolute else "REL", 0, 0)
         for name in self._values:
-            found[name] = (partial(self._set_trigger, name), 1, 1)
-            found[f"{name}?"] = (partial(self._get_trigger, name), 0, 0)
-        return found
+            commands[name] = (partial(self._set_trigger, name), 1, 1)
+            commands[f"{name}?"] = (partial(self._get_trigger, name), 0, 0)
+        return commands
 
     def _restart(self, _: list[str]) -> None:
         self._reset()
@@ -380,19 +380,19 @@ def _channels(text: str, *, empty: bool = False) -> list[int]:
     match = re.fullmatch(r"\(@([0-9:,\s]*)\)", text)
     if match is None:
         raise _RefusedError(-102)
-    found: list[int] = []
+    channels: list[int] = []
     for part in filter(None, (piece.strip() for piece in match[1].split(","))):
         first, colon, last = part.partition(":")
         if not first.isdigit() or (colon and not last.isdigit()) or len(part) > 7:
             raise _RefusedError(-102)
-        found += range(int(first), int(last if colon else first) + 1)
-    if not found and not empty:
+        channels += range(int(first), int(last if colon else first) + 1)
+    if not channels and not empty:
         raise _RefusedError(113)
-    if any(channel // 100 != 1 for channel in found):
+    if any(channel // 100 != 1 for channel in channels):
         raise _RefusedError(111)
-    if any(channel not in CHANNELS for channel in found):
+    if any(channel not in CHANNELS for channel in channels):
         raise _RefusedError(112)
-    return sorted(set(found))
+    return sorted(set(channels))
 
 
 def _block(text: str) -> str:

@@ -52,14 +52,14 @@ class Inputs:
 def _numbers(address: Address, key: str, n: int) -> frozenset[int]:
     text = address.params.get(key, "")
     try:
-        found = frozenset(int(part) for part in text.split(",") if part)
+        numbers = frozenset(int(part) for part in text.split(",") if part)
     except ValueError:
-        found = frozenset((-1,))
-    if not found <= frozenset(range(n)):
+        numbers = frozenset((-1,))
+    if not numbers <= frozenset(range(n)):
         raise InstrumentError(
             f"'{key}' in '{address.url}': expected inputs from 0 to {n - 1}; found '{text}'", code="simulator.setting"
         )
-    return found
+    return numbers
 
 
 class Unplugging:

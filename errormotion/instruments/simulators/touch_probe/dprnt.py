@@ -122,9 +122,9 @@ class SimulatedPrinter(SimulatedDevice):
 
 def _choice(address: Address, key: str, choices: tuple[str, ...]) -> str:
     """Return a parameter; by default the first choice."""
-    found = address.params.get(key, choices[0])
-    if found not in choices:
+    choice = address.params.get(key, choices[0])
+    if choice not in choices:
         raise InstrumentError(
-            f"'{key}' in '{address.url}': expected {', '.join(choices)}; found '{found}'", code="simulator.setting"
+            f"'{key}' in '{address.url}': expected {', '.join(choices)}; found '{choice}'", code="simulator.setting"
         )
-    return found
+    return choice

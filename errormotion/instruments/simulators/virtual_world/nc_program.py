@@ -107,8 +107,8 @@ def interpret(
 
 def title(text: str) -> str:
     """Return the first comment of a program, which states its purpose; "program" if it has none."""
-    found = re.search(r"\(([^()\n]*)\)|;(.*)", text)
-    return ((found[1] or found[2] or "").strip() if found else "") or "program"
+    match = re.search(r"\(([^()\n]*)\)|;(.*)", text)
+    return ((match[1] or match[2] or "").strip() if match else "") or "program"
 
 
 def _words(number: int, line: str) -> list[tuple[str, float]]:

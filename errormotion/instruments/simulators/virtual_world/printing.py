@@ -88,14 +88,14 @@ def parse_block(template: str, value_of: Callable[[str], float]) -> Block:
     return Block(tuple(parts))
 
 
-def _number(found: re.Match[str], value_of: Callable[[str], float]) -> Number:
-    whole, decimals = int(found[2]), int(found[3])
+def _number(match: re.Match[str], value_of: Callable[[str], float]) -> Number:
+    whole, decimals = int(match[2]), int(match[3])
     if not 0 < whole + decimals <= MAX_DIGITS:
         raise InstrumentError(
-            f"'{found[0]}': expected 1 to {MAX_DIGITS} digits in all; found {whole + decimals}",
+            f"'{match[0]}': expected 1 to {MAX_DIGITS} digits in all; found {whole + decimals}",
             code="machine.print.digits",
         )
-    return Number(value_of(found[1]), whole, decimals)
+    return Number(value_of(match[1]), whole, decimals)
 
 
 def _written(number: Number, control: Control, zeros: Zeros) -> str:

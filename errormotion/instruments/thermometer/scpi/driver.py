@@ -75,13 +75,13 @@ class ScpiTemperature(LineThermometer):
 
     def errors(self) -> list[str]:
         """Read and empty the error queue of the unit; return entries such as ``-113 Undefined header``."""
-        found = []
+        texts = []
         for _ in range(MAX_ERRORS):
             number, text = self._query("SYST:ERR?", codec.parse_error)
             if not number:
                 break
-            found.append(f"{number} {text}")
-        return found
+            texts.append(f"{number} {text}")
+        return texts
 
     def _measure(self) -> dict[str, tuple[float, str]]:
         if not self._ready:
@@ -99,11 +99,11 @@ class ScpiTemperature(LineThermometer):
     def _by_channel(self, text: str) -> dict[int, float]:
         """Return the readings of a scan by channel; ProtocolError unless each channel has one."""
         pairs = codec.parse_readings(text)
-        found = [channel for channel, _ in pairs]
-        if sorted(found) != sorted(self.settings.numbers):
+        channels = [channel for channel, _ in pairs]
+        if sorted(channels) != sorted(self.settings.numbers):
             raise ProtocolError(
                 f"{self.address}: expected one reading of each of the channels "
-                f"{codec.channel_list(sorted(self.settings.numbers))}; found {codec.channel_list(found)}",
+                f"{codec.channel_list(sorted(self.settings.numbers))}; found {codec.channel_list(channels)}",
                 code="thermometer.channels.differ",
             )
         return dict(pairs)

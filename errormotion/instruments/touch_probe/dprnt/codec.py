@@ -90,12 +90,12 @@ def parse_line(text: str, pattern: re.Pattern[str], *, length: float = MM, time:
             f"Expected a line of at most {MAX_LINE} characters; found {len(text)}: '{text[:60]}'",
             code="protocol.reply.too_long",
         )
-    found = pattern.fullmatch(text.strip())
-    if found is None:
+    match = pattern.fullmatch(text.strip())
+    if match is None:
         raise ProtocolError(
             f"Expected a line such as 'N12 X12.345 Y-3.210 Z100.000'; found '{text[:60]}'", code="protocol.touch.form"
         )
-    groups = found.groupdict()
+    groups = match.groupdict()
     try:
         x, y, z = (_value(groups[name]) * length for name in "xyz")
         number = int(groups["number"]) if groups.get("number") else None

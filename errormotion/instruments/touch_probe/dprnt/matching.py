@@ -36,17 +36,17 @@ def touch_of(line: Line, touches: list[Touch], due: int, last: Line | None, firs
             )
         return index
     candidates = [*range(due, len(touches)), *range(due)]
-    found: list[int] = [index for index in candidates if is_on_path(line, touches[index], margin)]
+    numbers: list[int] = [index for index in candidates if is_on_path(line, touches[index], margin)]
     repeated = last is not None and last.position == line.position
-    if repeated and (not found or found[0] != due):
+    if repeated and (not numbers or numbers[0] != due):
         return REPEATED
-    if not found:
+    if not numbers:
         raise InstrumentError(
             f"a contact was printed at {_text(line)}, which is on the path of no touch; check that program and "
             "touches agree, and the unit of lengths",
             code="touch.path.none",
         )
-    return found[0]
+    return numbers[0]
 
 
 def is_on_path(line: Line, touch: Touch, margin: float) -> bool:

@@ -239,15 +239,15 @@ class SdoClient:
         last = time.monotonic() + MAX_TIME * self.timeout
         while True:
             self._send(segment_request(toggle), None)
-            found = segment_reply(self._next(min(last, time.monotonic() + self.timeout)), toggle)
-            if found is None:
+            segment = segment_reply(self._next(min(last, time.monotonic() + self.timeout)), toggle)
+            if segment is None:
                 raise self._ended(index, subindex, "received a segment of another transfer")
-            data += found[0]
+            data += segment[0]
             if len(data) > MAX_TRANSFER:
                 raise self._ended(index, subindex, f"received more than {MAX_TRANSFER} bytes")
-            if found[1]:
+            if segment[1]:
                 break
-            if not found[0]:
+            if not segment[0]:
                 raise self._ended(index, subindex, "received a segment without data")
             toggle ^= 1
         if size and len(data) != size:

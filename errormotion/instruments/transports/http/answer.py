@@ -178,10 +178,10 @@ class Head:
         ProtocolError
             The body is larger than ``limit`` bytes, or incomplete.
         """
-        found = bytearray()
-        while data := self.some(limit + 1 - len(found)):
-            found += data
-            if len(found) > limit:
+        content = bytearray()
+        while data := self.some(limit + 1 - len(content)):
+            content += data
+            if len(content) > limit:
                 raise ProtocolError(
                     f"{self._url}: the answer is larger than {limit} bytes", code="protocol.reply.too_long"
                 )
@@ -190,7 +190,7 @@ class Head:
                 f"{self._url}: the answer is incomplete: {self.missing} bytes are missing",
                 code="protocol.http.incomplete",
             )
-        return bytes(found)
+        return bytes(content)
 
     def some(self, most: int) -> bytes:
         """Return up to ``most`` bytes of the body; none at its end."""
@@ -241,10 +241,10 @@ class Head:
         line = self._source.line()
         if line is None:
             raise EOFError
-        found = _STATUS_LINE.fullmatch(line.decode("latin-1"))
-        if not found:
+        match = _STATUS_LINE.fullmatch(line.decode("latin-1"))
+        if not match:
             raise ProtocolError(f"{self._url}: expected an HTTP answer; found {line[:80]!r}", code="protocol.http.form")
-        return int(found[1]), int(found[2])
+        return int(match[1]), int(match[2])
 
     def _fields(self) -> dict[str, str]:
         return header_fields(self._source.line, self._url)
@@ -258,7 +258,7 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
     ProtocolError
         There are more than `MAX_HEAD_LINES` lines or two different lengths, or the connection ended.
     """
-    found: dict[str, str] = {}
+    fields: dict[str, str] = {}
     for _ in range(MAX_HEAD_LINES + 1):
         line = next_line()
         if line is None:
@@ -266,14 +266,14 @@ def header_fields(next_line: Callable[[], bytes | None], url: str) -> dict[str, 
                 f"{url}: the connection ended within the head of an answer or part", code="protocol.http.incomplete"
             )
         if not line:
-            return found
+            return fields
         name, _, value = line.decode("latin-1").partition(":")
         key, text = name.strip().lower(), value.strip()
-        if key == "content-length" and found.get(key, text) != text:
+        if key == "content-length" and fields.get(key, text) != text:
             raise ProtocolError(
-                f"{url}: two lengths of the body, '{found[key][:20]}' and '{text[:20]}'", code="protocol.http.length"
+                f"{url}: two lengths of the body, '{fields[key][:20]}' and '{text[:20]}'", code="protocol.http.length"
             )
-        found[key] = text
+        fields[key] = text
     raise ProtocolError(f"{url}: a head of more than {MAX_HEAD_LINES} lines", code="protocol.http.head")
 
 

@@ -211,10 +211,10 @@ class ModbusServer:
         if function in (WRITE_ONE, WRITE_SEVERAL) and self._write is not None:
             refusal = self._written(function, pdu[1:], self._write)
             return bytes((function | 0x80, refusal)) if refusal else pdu[:5]
-        found = self._read(function, pdu[1:])
-        if isinstance(found, int):
-            return bytes((function | 0x80, found))
-        return struct.pack(f">BB{len(found)}H", function, 2 * len(found), *found)
+        answer = self._read(function, pdu[1:])
+        if isinstance(answer, int):
+            return bytes((function | 0x80, answer))
+        return struct.pack(f">BB{len(answer)}H", function, 2 * len(answer), *answer)
 
     def _read(self, function: int, arguments: bytes) -> list[int] | int:
         if function != self._function or function not in READ_FUNCTIONS:

@@ -86,7 +86,7 @@ def readings(state: State) -> dict[str, Any]:
     """
     moving = bool(state["running"] or state["stepping"])
     speed, wanted = state["spindle_speed"], state["commanded_spindle_speed"]
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "moving": moving,
         "homed": state["homed"],
         "mode": state["mode"],
@@ -99,11 +99,11 @@ def readings(state: State) -> dict[str, Any]:
         "direction": 0 if abs(speed) < STEADY else 1 if speed > 0 else 2,
     }
     for i, axis in enumerate(AXES):
-        found[f"{axis}.actual"] = state["position"][i] * _MM
-        found[f"{axis}.set"] = state["commanded_position"][i] * _MM
+        values[f"{axis}.actual"] = state["position"][i] * _MM
+        values[f"{axis}.set"] = state["commanded_position"][i] * _MM
         # unknown during a motion
-        found[f"{axis}.left"] = None if moving else 0.0
-    return found
+        values[f"{axis}.left"] = None if moving else 0.0
+    return values
 
 
 def _spindle(speed: float, wanted: float) -> int:

@@ -102,18 +102,18 @@ def value(machine: Machine, node: ua.NodeId) -> ua.DataValue | None:
     identifier = node.Identifier
     if node.NamespaceIndex != INDEX or not isinstance(identifier, str) or len(identifier) > MAX_ID:
         return None
-    found = _ID.fullmatch(identifier)
-    if found is None or found[1] not in VARIABLES:
+    match = _ID.fullmatch(identifier)
+    if match is None or match[1] not in VARIABLES:
         return None
-    variable = VARIABLES[found[1]]
-    unit, first = int(found[2] or 1), int(found[3] or 1)
+    variable = VARIABLES[match[1]]
+    unit, first = int(match[2] or 1), int(match[3] or 1)
     last = first
-    if found[5]:
-        last = first + int(found[5]) - 1 if found[4] else int(found[5])
+    if match[5]:
+        last = first + int(match[5]) - 1 if match[4] else int(match[5])
     if unit != 1 or not 1 <= first <= last <= variable.rows:
         return ua.DataValue(ua.Variant(), ua.StatusCode(ua.UInt32(StatusCodes.BadAttributeIdInvalid)))
     rows = [variable.read(machine, row) for row in range(first - 1, last)]
-    if not found[5]:
+    if not match[5]:
         return machine.value(identifier, rows[0], variable.kind)
     return machine.value(identifier, None if None in rows else rows, variable.kind)
 

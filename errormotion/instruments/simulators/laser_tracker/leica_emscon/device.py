@@ -165,10 +165,10 @@ class SimulatedEmScon(SimulatedDevice):
         block = next((block for block in self.blocks.values() if block.get == name), None)
         if block is not None:
             return self.wire.reply(number, 0, block.values)
-        found = self._commands.do(name, values)
-        if isinstance(found, bytes):
-            return found
-        return self.wire.reply(number, found) if isinstance(found, int) else self.wire.reply(number, 0, found)
+        answer = self._commands.do(name, values)
+        if isinstance(answer, bytes):
+            return answer
+        return self.wire.reply(number, answer) if isinstance(answer, int) else self.wire.reply(number, 0, answer)
 
     @staticmethod
     def _allowed_while_measuring(name: str) -> bool:

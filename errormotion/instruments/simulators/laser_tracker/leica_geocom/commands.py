@@ -66,8 +66,8 @@ class Commands(Measuring):
         ------
         RefusedError
         """
-        found = getattr(self, name)(*values)
-        return found if isinstance(found, tuple) else () if found is None else (found,)
+        result = getattr(self, name)(*values)
+        return result if isinstance(result, tuple) else () if result is None else (result,)
 
     # ------------------------------------------------------------------ COM
 

@@ -75,16 +75,16 @@ class SimulatedGeoComStation(SimulatedDevice):
     def answer(self, request: bytes) -> bytes:
         """Return the reply to one request."""
         try:
-            found = grammar.parse(request)
+            call = grammar.parse(request)
         except grammar.ProtocolError as error:
             return grammar.refusal(error.code, error.transaction)
         if self.fault.affects("refuse", self._answers):
-            return grammar.reply(self._code, found.transaction)
+            return grammar.reply(self._code, call.transaction)
         if self.fault.affects("link_error", self._answers):
-            return grammar.refusal(self._code, found.transaction)
+            return grammar.refusal(self._code, call.transaction)
         self.commands.warning = 0
         try:
-            values = self.commands.do(found.name, found.values)
+            values = self.commands.do(call.name, call.values)
         except RefusedError as refused:
-            return grammar.reply(refused.code, found.transaction)
-        return grammar.reply(self.commands.warning, found.transaction, grammar.encode(values, DECIMALS))
+            return grammar.reply(refused.code, call.transaction)
+        return grammar.reply(self.commands.warning, call.transaction, grammar.encode(values, DECIMALS))

@@ -115,16 +115,16 @@ def parse(line: bytes) -> Request:
     """
     if len(line) > LONGEST:
         raise ProtocolError(Code.COM_OVERRUN)
-    found = _REQUEST.fullmatch(line.decode("latin-1"))
-    if found is None:
+    match = _REQUEST.fullmatch(line.decode("latin-1"))
+    if match is None:
         raise ProtocolError(Code.COM_NOT_GEOCOM)
-    number, transaction = int(found[1]), int(found[2] or 0)
-    if found[3] is not None:
+    number, transaction = int(match[1]), int(match[2] or 0)
+    if match[3] is not None:
         raise ProtocolError(Code.COM_NO_CHECKSUM, transaction)
     if number not in CALLS:
         raise ProtocolError(Code.COM_PROC_UNAVAIL, transaction)
     name, types = CALLS[number]
-    words = found[4].split(",") if found[4] else []
+    words = match[4].split(",") if match[4] else []
     if len(words) != len(types):
         raise ProtocolError(Code.COM_CANT_DECODE_REQ, transaction)
     values = tuple(_value(word, kind) for word, kind in zip(words, types, strict=True))

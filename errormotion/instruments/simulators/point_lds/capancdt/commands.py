@@ -182,10 +182,10 @@ def _linearisation(controller: Controller, text: str) -> str:
 
 
 def _pair(controller: Controller, text: str) -> tuple[int, int]:
-    found = _PAIR.fullmatch(text)
-    if not found or int(found[1]) not in controller.sensors:
+    match = _PAIR.fullmatch(text)
+    if not match or int(match[1]) not in controller.sensors:
         raise Refused(WRONG_PARAMETER)
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def _point(controller: Controller, text: str) -> tuple[int, int]:
@@ -223,11 +223,11 @@ def _version(_: Controller, text: str) -> str:
 
 
 def _set_function(controller: Controller, text: str) -> str:
-    found = _MATH.fullmatch(text)
-    if not found:
+    match = _MATH.fullmatch(text)
+    if not match:
         raise Refused(WRONG_PARAMETER)
-    factors = tuple(float(factor) for factor in found.groups()[2:])
-    controller.settings.functions[int(found[1])] = MathFunction(int(found[2], 16), factors)
+    factors = tuple(float(factor) for factor in match.groups()[2:])
+    controller.settings.functions[int(match[1])] = MathFunction(int(match[2], 16), factors)
     return f",{OK}"
 
 
