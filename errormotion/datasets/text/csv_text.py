@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from errormotion.datasets.files.reading import read_bytes
+from errormotion.datasets.tables.encoding import decode
+from errormotion.datasets.tables.format import Format
+from errormotion.datasets.tables.numbers import signs
+from errormotion.datasets.tables.recognition import split
 from errormotion.errors import DatasetError
 
 MAX_FILE = 64 << 20
@@ -18,10 +22,11 @@ _KEY = re.compile(r"#\s*([^\W\d]\w*)\s*=\s*(.*)")
 
 @dataclass(frozen=True)
 class Table:
-    """Lines between empty ones: the header line and those below it, each with its number."""
+    """Lines between empty ones: the header line and those below it, each with its number; and the signs of numbers."""
 
     head: tuple[int, list[str]]
     rows: list[tuple[int, list[str]]]
+    form: Format
 
 
 def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
@@ -30,7 +35,7 @@ def blocks(path: Path) -> tuple[dict[str, tuple[int, str]], list[Table]]:
     Parameters
     ----------
     path : Path
-        UTF-8 text; fields are separated by tabulator, semicolon or comma, according to the first line of a table.
+        Text; fields are separated by tabulator, semicolon or comma, according to the first line of a table.
 
     Returns
     -------
@@ -76,16 +81,7 @@ def _lines(path: Path) -> list[str]:
         data = read_bytes(path, MAX_FILE)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}", code="file.unreadable") from error
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise DatasetError(f"{path}: is UTF-16; expected UTF-8. Save it as 'CSV UTF-8'", code="text.encoding")
-    try:
-        return data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise DatasetError(
-            f"{path}, line {line}: byte 0x{data[error.start]:02x} is not UTF-8; save the file as 'CSV UTF-8'",
-            code="text.encoding",
-        ) from error
+    return decode(data, "auto", path)[0].splitlines()
 
 
 def _split(path: Path, block: list[tuple[int, str]]) -> Table:
@@ -94,10 +90,21 @@ def _split(path: Path, block: list[tuple[int, str]]) -> Table:
     rows = []
     for number, line in block:
         try:
-            (fields,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True)
+            rows.append((number, split(line, delimiter)))
         except csv.Error as error:
             raise DatasetError(
                 f"{path}, line {number}: cannot be split into fields: {error}", code="csv.fields"
             ) from error
-        rows.append((number, [text.strip() for text in fields]))
-    return Table(rows[0], rows[1:])
+    return Table(rows[0], rows[1:], _form(path, delimiter, rows[1:]))
+
+
+def _form(path: Path, delimiter: str, rows: list[tuple[int, list[str]]]) -> Format:
+    """Return the signs of the numbers; DatasetError where a comma may be the decimal sign or separate thousands."""
+    decimal, thousands, unclear = (".", "", "") if delimiter == "," else signs(text for _, row in rows for text in row)
+    if unclear:
+        raise DatasetError(
+            f"{path}, line {rows[0][0]}: the comma in '{unclear}' may be the decimal sign or separate thousands; write "
+            "decimal points, and no sign between thousands",
+            code="file.numbers.ambiguous",
+        )
+    return Format(delimiter=delimiter, decimal=decimal, thousands=thousands or None)  # type: ignore[arg-type]

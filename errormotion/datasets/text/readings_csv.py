@@ -59,7 +59,8 @@ def read_csv(path: str | Path) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        UTF-8 text; fields are separated by comma, semicolon or tabulator, the decimal sign is a point.
+        Text; fields are separated by comma, semicolon or tabulator. The decimal sign of a table is a point or a comma,
+        that of the header a point.
 
     Returns
     -------
@@ -150,13 +151,18 @@ def _cells(table: Table, columns: Mapping[int, Column], keys: Mapping[str, int],
             text, title = texts[place], f"column '{titles[place]}'"
             if text in _EMPTY and column.may_be_empty:
                 continue
-            if not NUMBER.fullmatch(text) or not np.isfinite(float(text)):
+            try:
+                plain = table.form.plain(text)
+            except ValueError as error:
+                mistakes.add(line, f"{title}: {error}")
+                continue
+            if not NUMBER.fullmatch(plain) or not np.isfinite(float(plain)):
                 comma = " (the decimal sign is a point)" if "," in text else ""
                 shown = f"'{text}'" if text else "nothing"
                 mistakes.add(line, f"{title}: expected a number; found {shown}{comma}")
                 numbers[place][k] = 0.0  # reported; nothing is read from this table
                 continue
-            numbers[place][k] = float(text)
+            numbers[place][k] = float(plain)
     labels = {place: [texts[place] for _, texts in rows] for place in keys.values()}
     return Cells(table.head, np.array([line for line, _ in rows], dtype=np.int64), labels, numbers)
 
