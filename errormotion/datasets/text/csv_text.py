@@ -107,4 +107,4 @@ def _form(path: Path, delimiter: str, rows: list[tuple[int, list[str]]]) -> Form
             "decimal points, and no sign between thousands",
             code="file.numbers.ambiguous",
         )
-    return Format(delimiter=delimiter, decimal=decimal, thousands=thousands or None)  # type: ignore[arg-type]
+    return Format.model_validate({"delimiter": delimiter, "decimal": decimal, "thousands": thousands or None})
