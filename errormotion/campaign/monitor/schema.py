@@ -15,7 +15,7 @@ def _with_gaps(raw: xr.Dataset) -> xr.Dataset:
     ]
     if "gap" in raw or not readings:
         return raw
-    empty = [np.isnan(each).all([dim for dim in each.dims if dim != "time"]).values for each in readings]
+    empty = [each.isnull().all([dim for dim in each.dims if dim != "time"]).values for each in readings]
     gap = np.logical_and.reduce(empty).astype(float)[:, None]
     return raw.assign(gap=(("time", "source"), gap, {"units": "1"})).assign_coords(source=["file"])
 

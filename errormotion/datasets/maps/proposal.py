@@ -157,9 +157,9 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
             if error.code != "file.numbers.ambiguous" or "decimal" in form:
                 raise
             return _unreadable(state, error)
-        columns = tuple(tuple(contents(table)) for table in tables)
+        read = tuple(tuple(contents(table)) for table in tables)
         counts = tuple(len(table.lines) for table in tables)
-        state = replace(state, columns=columns, counts=counts, form=form)
+        state = replace(state, columns=read, counts=counts, form=form)
     fits = _fits(state)
     candidates = tuple(Choice(each.raw.title, _described(each.raw)) for each, _ in fits)
     wanted = state.answers.get("raw", "")
