@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Self
 
@@ -116,13 +117,19 @@ class Bars:
         if self._task is not None:
             self._progress.update(self._task, note=text)
 
-    def ask(self, message: str) -> None:
-        """Show a request to the operator and wait for Enter."""
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Hide the bars, so that a person can read and type."""
         self._progress.stop()
         try:
-            self._console.answer(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ")
+            yield
         finally:
             self._progress.start()
+
+    def ask(self, message: str) -> None:
+        """Show a request to the operator and wait for Enter."""
+        with self.paused():
+            self._console.answer(f"\n{message}\nPress Enter when it is done, Ctrl-C to stop: ")
 
     def release(self, motions: Sequence[str]) -> None:
         """Show the motions of the tests, and wait for the word that releases them.

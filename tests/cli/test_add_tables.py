@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ import numpy as np
 import openpyxl
 import pytest
 from command_line import CliRunner
+from forked_commands import Commands
+from terminal import Terminal
 
 from errormotion import datasets
 from errormotion.campaign.folder import RunFolder
@@ -221,3 +224,29 @@ def test_a_file_without_a_table_leaves_nothing(run: Run, tmp_path: Path) -> None
     for name in ("photo.jpg", "letter.txt"):
         assert name in run("add", name, "--yes", code=1).stderr
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def commands() -> Iterator[Commands]:
+    with Commands() as started:
+        yield started
+
+
+@pytest.mark.slow
+def test_the_bars_are_hidden_while_a_person_types(commands: Commands, tmp_path: Path) -> None:
+    positioning(tmp_path / "X.xlsx")
+    terminal = Terminal(commands, tmp_path, "add", "X.xlsx", *FAST, TERM="xterm", COLUMNS="120")
+    try:
+        terminal.wait_for("Answer:")
+        asked = len(terminal.shown)
+        time.sleep(1.0)  # ten refreshes of the bars
+        terminal.wait_for("Answer:")
+        assert "reading the files" not in terminal.shown[asked:]
+        for prompt, text in (("Which axis", "VMC"), ("Which error", ""), ("functional_point", ""), ("length_unc", "")):
+            terminal.type(f"{text}\r")
+            terminal.wait_for(prompt)
+        terminal.type("\r")
+        assert terminal.end() == 0
+    finally:
+        terminal.close()
+    assert "linear_positioning-X of VMC" in terminal.shown

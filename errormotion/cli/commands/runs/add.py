@@ -32,8 +32,13 @@ def add(request: Request, assignments: Sequence[str], yes: bool, as_json: bool) 
         settings=lambda model: read_settings(model, None, settings),
         answers={key.strip(): text.strip() for key, _, text in (each.partition("=") for each in answers)},
     )
-    ask: Ask = take_proposals if yes else _asked if on_terminal() and not as_json else refuse
     with Bars(as_json) as bars:
+
+        def asked(questions: Sequence[Question], mistake: str = "") -> Mapping[str, str]:
+            with bars.paused():
+                return _asked(questions, mistake)
+
+        ask: Ask = take_proposals if yes else asked if on_terminal() and not as_json else refuse
         added = add_files(request, ask, report=report_of_run, stage=bars.stage)
     conformity = added.folder.data.get("conformity")
     if as_json:
