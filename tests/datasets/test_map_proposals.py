@@ -1,6 +1,7 @@
 """Proposed maps: what is recognised of files of laboratories, what is asked, and that the written map reads them."""
 
 from collections.abc import Mapping
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -210,3 +211,38 @@ def test_directions_may_be_signs_of_one(tmp_path) -> None:
     text = LONG.replace(";+;", ";1;").replace(";-;", ";-1;")
     names = accepted(propose([file_of(tmp_path, text)]), {}).map["labels"]["approach"]["names"]
     assert names == {"1": "forward", "-1": "backward"}
+
+
+@pytest.mark.parametrize(
+    ("text", "axis"),
+    [
+        (POSITIONING.replace("Position", "Pos. Y"), "Y"),
+        ("Messung der Z-Achse\n" + POSITIONING, "Z"),
+        (POSITIONING.replace("Abweichung", "EXX"), "X"),
+        (POSITIONING, ""),
+    ],
+)
+def test_the_axis_is_that_of_a_title_or_a_line_above(tmp_path, text: str, axis: str) -> None:
+    proposed = {question.key: question.proposed for question in propose([file_of(tmp_path, text)]).questions}
+    assert proposed["attributes.axis"] == axis
+
+
+def test_two_sheets_are_one_dataset(tmp_path) -> None:
+    """Temperatures of one sheet, with dates of their own, at the times of the readings of the other."""
+    from openpyxl import Workbook
+
+    book, start = Workbook(), datetime(2026, 5, 4, 8)
+    readings, warm = book.active, book.create_sheet("Temp")
+    readings.title = "Weg"
+    readings.append(["Zeit", *(f"{name} [µm]" for name in ("X1", "X2", "Y1", "Y2", "Z"))])
+    warm.append(["Zeit", "T Rahmen [°C]"])
+    for k in range(10):
+        readings.append([start + timedelta(seconds=30 * k), 1000.5, 1001.0, 1002.0, 1003.0, 1004.0 + k])
+    for k in range(4):
+        warm.append([start + timedelta(seconds=100 * k), 20 + k])
+    file = tmp_path / "book.xlsx"
+    book.save(file)
+    write_map(accepted(propose([file]), BEAMS), tmp_path / "map.toml")
+    raw = import_files([file], tmp_path / "map.toml")
+    np.testing.assert_allclose(raw["temperature"].squeeze(), 20 + 0.3 * np.arange(10), rtol=1e-12)
+    assert known_map([file], [tmp_path / "map.toml"])

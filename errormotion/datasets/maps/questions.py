@@ -157,6 +157,9 @@ def _attribute(name: str, allowed: Sequence[str], main: Fit, above: Sequence[str
     """Return the value of an attribute that a freedom, a title or a line of the file states; empty if none does."""
     words = {name.lower(), *(("achse", "axis") if name == "axis" else ())}
     found = [each.key[-1] for each in main.columns if re.search(r"\.E[XYZABC][XYZABC]$", each.key)]
+    scalars = [each for each in main.columns if each.name.startswith("target") and "." not in each.key]
+    for each in scalars:  # the position of an axis names it: Pos. X
+        found += [value for value in allowed if value.lower() in tokens(each.column.title)]
     for text in (*above, *(each.column.title for each in main.columns)):
         own = tokens(text)
         for value in allowed:
