@@ -246,3 +246,16 @@ def test_two_sheets_are_one_dataset(tmp_path) -> None:
     raw = import_files([file], tmp_path / "map.toml")
     np.testing.assert_allclose(raw["temperature"].squeeze(), 20 + 0.3 * np.arange(10), rtol=1e-12)
     assert known_map([file], [tmp_path / "map.toml"])
+
+
+def test_a_comma_of_two_meanings_is_asked(tmp_path) -> None:
+    log = file_of(tmp_path, "Zeit [s];T1 [C]\n" + "".join(f"{k},000;20,12{k}\n" for k in range(1, 6)))
+    proposal = propose([log])
+    (question,) = proposal.questions
+    assert (question.key, question.proposed, question.needed) == ("format.decimal", "", True)
+    proposal = accepted(proposal.answered({"format.decimal": ","}), {})
+    write_map(proposal, tmp_path / "map.toml")
+    raw = import_files([log], tmp_path / "map.toml")
+    np.testing.assert_allclose(raw["temperature"].squeeze(), 20.12 + 1e-3 * np.arange(1, 6))
+    with pytest.raises(DatasetError, match="no map can be proposed: The decimal sign cannot be seen"):
+        write_map(propose([log]), tmp_path / "other.toml")

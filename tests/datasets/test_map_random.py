@@ -10,7 +10,7 @@ import pytest
 
 from errormotion.datasets.importing import import_files
 from errormotion.datasets.maps.proposal import propose
-from errormotion.datasets.maps.writing import write_map
+from errormotion.datasets.maps.writing import text_of, write_map
 from errormotion.errors import DatasetError
 
 FILES = 40
@@ -229,3 +229,26 @@ def test_random_files_are_read_rightly_or_asked_for(tmp_path: Path, written, per
             found = found.transpose(*(dim for dim in order if dim in found.dims))
             np.testing.assert_allclose(found.values, expected, rtol=1e-6, atol=6e-9, err_msg=f"{seed} {name}")
     assert read >= (READ if person else PROPOSED) * FILES
+
+
+@pytest.mark.slow
+def test_damaged_files_are_proposed_or_refused(tmp_path: Path) -> None:
+    """Changed, cut and repeated bytes: no error but that of the package."""
+    path = tmp_path / "file.csv"
+    for seed in range(FILES):
+        rng = random.Random(seed)
+        rng.choice((drift, positioning, lengths, thermometers))(rng, path)
+        data = bytearray(path.read_bytes())
+        for _ in range(rng.randint(1, 12)):
+            k = rng.randrange(len(data))
+            data[k : k + rng.choice((0, 1, 20))] = rng.choice((b"", b";", data[rng.randrange(len(data)) :][:30]))
+        path.write_bytes(data)
+        try:
+            proposal = propose([path])
+            while proposal.questions:
+                question = proposal.questions[0]
+                first = question.choices[0].value if question.choices else ""
+                proposal = proposal.answered({question.key: question.proposed or first})
+            text_of(proposal)
+        except DatasetError:
+            continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,7 +12,7 @@ import numpy as np
 from errormotion.arrays import Array
 from errormotion.datasets.maps.units import fitting_unit, orders, stated_unit
 from errormotion.datasets.schemas import Row
-from errormotion.datasets.tables.dates import ELAPSED
+from errormotion.datasets.tables.dates import ELAPSED, Clock
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.tables.numbers import no_value
 from errormotion.datasets.tables.table import Table
@@ -69,6 +70,14 @@ class Content:
         found: Array = self.table.numbers({self.index: self.title}, Mistakes(self.table.path))[self.index]
         return found
 
+    def seconds(self, unit: str, count: int) -> Array:
+        """Return the first dates that can be read with a unit, at most ``count``, as seconds since the first one."""
+        clock, found = Clock(unit, repeats=True), []
+        for text in self.texts[:count]:
+            with suppress(ValueError):
+                found.append(clock.seconds(text))
+        return np.array(found)
+
     @property
     def whole(self) -> bool:
         """Whether all numbers are whole."""
@@ -98,11 +107,13 @@ def contents(table: Table) -> list[Content]:
         before = joined[-1] if joined else None
         if before is not None and _is_day(before) and each.dates == (ELAPSED,):
             places = (before.index, each.index)
-            joined[-1] = Content(table, places, DATES, tuple(orders(table.texts(places))))
-            continue
+            if dates := tuple(orders(table.texts(places))):
+                joined[-1] = Content(table, places, DATES, dates)
+                continue
         joined.append(each)
     return [
-        replace(each, dates=tuple(orders(whole.texts(each.places)))) if len(each.dates) > 1 else each for each in joined
+        replace(each, dates=tuple(orders(whole.texts(each.places))) or each.dates) if len(each.dates) > 1 else each
+        for each in joined
     ]
 
 

@@ -13,7 +13,6 @@ from errormotion.datasets.maps.columns import DATES, EMPTY, NUMBERS, TEXTS, Cont
 from errormotion.datasets.maps.form import SEQUENCE
 from errormotion.datasets.maps.words import likeness, tokens, way_of
 from errormotion.datasets.schemas import RawSchema, Row
-from errormotion.datasets.tables.dates import Clock
 from errormotion.datasets.tables.table import name_of
 from errormotion.datasets.text.layout import targets
 from errormotion.datasets.text.table_reader import FREEDOM, Names
@@ -507,8 +506,7 @@ def _interval(schema: _Schema, found: Fit) -> float:
     if time is None or row is None:
         return 0.0
     if time.kind == DATES:
-        clock = Clock(time.dates[0], repeats=True)
-        values = np.array([clock.seconds(text) for text in time.texts[:_FEW] if text])
+        values = time.seconds(time.dates[0], _FEW)
     else:
         unit = time.unit_for(row)
         values = np.asarray(convert(time.values[:_FEW], unit or "s", "s"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from errormotion.datasets.maps.fit import Assigned, Fit, label_of
 from errormotion.datasets.maps.units import fitting_unit
 from errormotion.datasets.maps.words import likeness, tokens
 from errormotion.datasets.schemas import POSITION, RawSchema, Row
-from errormotion.datasets.tables.dates import COUNTED, EXCEL, UNIX, UNIX_MS
+from errormotion.datasets.tables.dates import COUNTED, EXCEL, UNIX, UNIX_MS, Clock
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.tables.table import name_of, same
 from errormotion.datasets.text.log_import import read_value
@@ -228,24 +229,19 @@ def _freedom(each: Assigned, answers: Mapping[str, str]) -> str:
 
 
 def _read(text: str, unit: str) -> str:
-    from errormotion.datasets.tables.dates import Clock
-
     clock = Clock(unit)
-    clock.seconds(text)
+    with suppress(ValueError):
+        clock.seconds(text)
     return clock.start.strftime("%d %B %Y") if clock.start else text
 
 
 def _order(column: Content) -> str:
     """Return the order of day and month with which the times of a column increase in short steps; empty for both."""
-    from errormotion.datasets.tables.dates import Clock
-
     if all("." in unit for unit in column.dates):
         return column.dates[0]
     able = []
     for unit in column.dates:
-        clock = Clock(unit, repeats=True)
-        seconds = np.array([clock.seconds(text) for text in column.texts[:2000] if text])
-        steps = np.diff(seconds)
+        steps = np.diff(column.seconds(unit, 2000))
         if (steps >= 0).all() and (not steps.size or steps.max() < 20 * 86400):
             able.append(unit)
     return able[0] if len(able) == 1 else ""
