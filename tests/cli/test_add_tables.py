@@ -159,6 +159,28 @@ def test_another_axis_in_a_table_of_the_same_kind_is_not_read_by_the_earlier_map
     assert [each.data["test"][-1] for each in found()] == ["X", "Y", "Z"]
 
 
+def test_a_script_does_not_take_the_axis_of_an_earlier_file(run: Run, tmp_path: Path) -> None:
+    printed = run(
+        "add", positioning(tmp_path / "a.xlsx", title="Messung"), "--yes", *FAST, "--axis", "X", "--machine", "M"
+    )
+    assert "columns.deviation = EXX" in printed.stdout  # what was proposed and taken is listed
+    other = positioning(tmp_path / "b.xlsx", title="Messung", seed=4)
+    message = run("add", other, "--yes", *FAST, code=1).stderr
+    assert "--axis AXIS" in message
+    assert "X in an earlier file" in message
+    run("add", other, "--yes", *FAST, "--axis", "Y")
+    assert [each.data["test"][-1] for each in found()] == ["X", "Y"]
+
+
+def test_a_script_does_not_take_the_machine_of_an_earlier_file_where_the_record_has_several(
+    run: Run, tmp_path: Path
+) -> None:
+    for seed, machine in enumerate(("A", "B"), 1):
+        run("add", positioning(tmp_path / f"{machine}.xlsx", seed=seed), "--yes", *FAST, "--machine", machine)
+    message = run("add", positioning(tmp_path / "c.xlsx", seed=3), "--yes", *FAST, code=1).stderr
+    assert "--machine NAME" in message
+
+
 def test_files_of_another_machine_are_asked_where_the_record_has_several(run: Run, tmp_path: Path) -> None:
     stated = [part for key, text in SET_UP.items() for part in ("--set", f"{key}={text}")]
     run("add", spindle_log(tmp_path / "a.csv"), "--yes", *stated)

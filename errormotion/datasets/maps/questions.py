@@ -62,6 +62,9 @@ class Question:
         What is taken without a person; empty if nothing can be proposed.
     needed : bool
         Whether there is no dataset without an answer.
+    earlier : str
+        What holds for an earlier file: a default for people, who know whether it holds again. It is never taken without
+        a person.
     """
 
     key: str
@@ -69,6 +72,7 @@ class Question:
     choices: tuple[Choice, ...]
     proposed: str
     needed: bool
+    earlier: str = ""
 
 
 def questions_of(

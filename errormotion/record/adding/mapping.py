@@ -94,10 +94,10 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
 
 def of_machine(question: Question, machines: Sequence[str]) -> Question:
     """Return the question for the machine, with those of the record as choices."""
-    names = dict.fromkeys(filter(None, (question.proposed, *machines)))
+    names = dict.fromkeys(filter(None, (question.proposed, question.earlier, *machines)))
     choices = tuple(Choice(name, name) for name in list(names)[:MAX_CHOICES])
     proposed = question.proposed or (choices[0].value if len(choices) == 1 else "")
-    return Question("machine", "On which machine was this measured?", choices, proposed, needed=True)
+    return Question("machine", "On which machine was this measured?", choices, proposed, True, question.earlier)
 
 
 def _asked(found: Proposal, request: Request, ask: Ask) -> tuple[dict[str, str], tuple[str, ...], Proposal]:
@@ -144,7 +144,7 @@ def _contradiction(
         question = questions.get(key)
         now = known.get(key) or (question.proposed if question is not None else "")
         if not now and question is not None and not key.startswith("values."):
-            asked = replace(question, proposed=str(text))
+            asked = replace(question, earlier=str(text))
             asked = of_machine(asked, machines) if key == "machine" else asked
             now = str(text) if len(asked.choices) == 1 else dict(ask([asked]))[key]
         if now and text not in (now, value_of(now)):

@@ -60,6 +60,8 @@ def _described(question: Question) -> str:
         parts.append("one of " + ", ".join(each.value for each in question.choices))
     if question.proposed:
         parts.append(f"proposed: {question.proposed}")
+    elif question.earlier:
+        parts.append(f"{question.earlier} in an earlier file of this kind")
     elif not question.needed:
         parts.append("may be omitted")
     return "; ".join(parts)

@@ -38,8 +38,18 @@ def add(request: Request, assignments: Sequence[str], yes: bool, as_json: bool) 
             with bars.paused():
                 return _asked(questions, mistake)
 
-        ask: Ask = take_proposals if yes else asked if on_terminal() and not as_json else refuse
+        taken: dict[str, str] = {}
+
+        def proposed(questions: Sequence[Question], mistake: str = "") -> Mapping[str, str]:
+            answers = take_proposals(questions, mistake)
+            taken.update(answers)
+            return answers
+
+        ask: Ask = proposed if yes else asked if on_terminal() and not as_json else refuse
         added = add_files(request, ask, report=report_of_run, stage=bars.stage)
+    if any(taken.values()):
+        stated = ", ".join(f"{key} = {text}" for key, text in taken.items() if text)
+        added = replace(added, notes=(*added.notes, f"proposed, and not stated by the file: {stated}"))
     conformity = added.folder.data.get("conformity")
     if as_json:
         described = describe(added.folder)
@@ -70,7 +80,8 @@ def _asked(questions: Sequence[Question], mistake: str = "") -> Mapping[str, str
     for number, choice in enumerate(question.choices, 1):
         text = choice.text if choice.text.startswith(choice.value) else f"{choice.value}: {choice.text}"
         show(f"  {number}  {text}", err=True)
-    default = str(values.index(question.proposed) + 1) if question.proposed in values else question.proposed
+    default = question.proposed or question.earlier
+    default = str(values.index(default) + 1) if default in values else default
     prompt = "Number" if values else "Answer"
     prompt += "" if question.needed else " (may be left empty)"
     answer = ""
