@@ -1,6 +1,7 @@
 """Small files that state or contain gigabytes are refused before a library reads them; ordinary ones are read."""
 
 import json
+import os
 import struct
 import time
 import tracemalloc
@@ -11,11 +12,16 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from coded import raises
 from numcodecs import Blosc, Zstd
+from scipy.io import savemat
 
 from errormotion.datasets.files.containers import check_netcdf
 from errormotion.datasets.files.hdf5 import Stored
 from errormotion.datasets.storage.disk import load, save
+from errormotion.datasets.tables import binary
+from errormotion.datasets.tables.format import Format
+from errormotion.datasets.tables.reading import read_table
 from errormotion.errors import DatasetError
 
 TEXTS, LENGTH = 20_000, 100_000  # 2 GB of texts in 0.4 MB
@@ -310,3 +316,85 @@ def test_a_netcdf_file_with_64_bit_counts_is_refused_and_not_read_as_another_for
     path = tmp_path / "cdf5.nc"
     path.write_bytes(b"CDF\5" + bytes(64))
     refuse(path, "is not a dataset")
+
+
+def refuse_table(path: Path, code: str, sheet: str = "") -> None:
+    """Assert that a table is refused with a code, before much memory is needed."""
+    tracemalloc.start()
+    try:
+        with raises(code):
+            read_table(path, Format(sheet=sheet))
+        assert tracemalloc.get_traced_memory()[1] < MAX_MEMORY
+    finally:
+        tracemalloc.stop()
+
+
+def foreign(path: Path) -> Path:
+    """Write a file of numbers that is not to be read."""
+    (path / "secret.bin").write_bytes(np.arange(20.0).tobytes())
+    with h5py.File(path / "secret.h5", "w") as file:
+        file["group/time"] = file["group/temperature"] = np.arange(20.0)
+    return path / "secret.bin"
+
+
+@pytest.mark.parametrize("kind", ["external", "virtual"])
+def test_a_table_of_hdf5_has_its_values_in_its_file(tmp_path: Path, kind: str) -> None:
+    secret, path = foreign(tmp_path), tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["time"] = np.arange(20.0)
+        if kind == "external":
+            file.create_dataset("t", (20,), "f8", external=[(str(secret), 0, 160)])
+        else:
+            layout = h5py.VirtualLayout((20,), "f8")
+            layout[:] = h5py.VirtualSource(str(tmp_path / "secret.h5"), "group/time", (20,))
+            file.create_virtual_dataset("t", layout)
+    refuse_table(path, "file.malicious")
+
+
+@pytest.mark.parametrize("sheet", ["g", "soft", "inner/g", "inner//g", "time", "/", "pipe"])
+def test_a_group_of_hdf5_is_not_a_link(tmp_path: Path, sheet: str) -> None:
+    foreign(tmp_path)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["inner/time"] = np.arange(20.0)
+        file["time"] = file["inner/time"]
+        file["g"] = file["inner/g"] = h5py.ExternalLink(str(tmp_path / "secret.h5"), "/group")
+        file["soft"] = h5py.SoftLink("/inner")
+        file["pipe"] = h5py.ExternalLink(str(tmp_path / "pipe"), "/group")  # reading it would wait for ever
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
+    refuse_table(tmp_path / "a.h5", "file.sheet.unknown", sheet)
+    assert read_table(tmp_path / "a.h5", Format(sheet="inner")).titles == ["time"]
+    assert read_table(tmp_path / "a.h5").titles == ["inner/time"]  # "time" is the same dataset
+
+
+def test_a_small_table_of_hdf5_does_not_state_gigabytes(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "fill.h5", "w") as file:
+        for k in range(20):
+            file.create_dataset(f"d{k}", (1 << 28,), "f8")
+    refuse_table(tmp_path / "fill.h5", "file.malicious")
+    with h5py.File(tmp_path / "wide.h5", "w") as file:
+        file.create_dataset("a", (1 << 16,), "S65535")
+    refuse_table(tmp_path / "wide.h5", "file.malicious")
+    with h5py.File(tmp_path / "deep.h5", "w") as file:
+        group = file
+        for _ in range(40):
+            group = group.create_group("g")
+        group["a"] = np.arange(20.0)
+    refuse_table(tmp_path / "deep.h5", "file.malicious")
+    with h5py.File(tmp_path / "unit.h5", "w") as file:
+        file["a"] = np.arange(20.0)
+        file["a"].attrs.create("units", np.array(["mm"] * 3000, object), dtype=h5py.string_dtype())
+        file["self"] = file["/"]
+    assert read_table(tmp_path / "unit.h5").units == [""]
+
+
+def test_a_small_file_of_matlab_or_netcdf3_does_not_unpack_to_gigabytes(tmp_path: Path) -> None:
+    """A cell states one value, whatever it contains; a compressed element any number; variables the same bytes."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"time": np.arange(20.0), "cell": np.array([np.arange(3.0), "a"], object)}, do_compression=True)
+    assert read_table(path).titles == ["time"]
+    packer = zlib.compressobj(9)
+    piece = bytes(1 << 20)
+    packed = b"".join(packer.compress(piece) for _ in range((binary.MAX_UNPACKED >> 20) + 2)) + packer.flush()
+    path.write_bytes(path.read_bytes() + struct.pack("<II", 15, len(packed)) + packed)
+    refuse_table(path, "file.too_large")

@@ -74,8 +74,7 @@ def check_netcdf(path: Path) -> None:
             )
         messages, total, variables = [], 0, {}
         for name in file:
-            link = file.get(name, getlink=True)
-            if not isinstance(link, h5py.HardLink):
+            if not is_inside(file, name):
                 messages.append(f"{name!r:.100}: expected values in this file; found a link")
                 continue
             variable = file[name]
@@ -96,6 +95,76 @@ def check_netcdf(path: Path) -> None:
             messages += [f"{name!r:.100}: {text}" for name, each in variables.items() for text in violations(each)]
             total += stored.texts(variables.values(), _most(size) - total)
     _raise(path, messages, total, size)
+
+
+def is_inside(group: h5py.Group, name: str) -> bool:
+    """Return whether a group of HDF5 contains an object, not a link to another place, which is not followed."""
+    # Group.get and "in" open the file of an external link, which may be a pipe.
+    try:
+        return bool(group.id.links.get_info(name.encode("utf-8", "surrogateescape")).type == h5py.h5l.TYPE_HARD)
+    except (KeyError, RuntimeError, ValueError):  # there is none
+        return False
+
+
+def datasets_in(path: Path, group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """Return the datasets of numbers and texts of fixed length in a group of a HDF5 file, by their paths in it.
+
+    Links are not followed, so that everything is in this file; nothing is read.
+
+    Raises
+    ------
+    DatasetError
+        There are too many objects, or too many levels of groups.
+    """
+    seen: set[int] = set()
+
+    def inside(parent: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:
+        for name in parent:
+            if not is_inside(parent, name):
+                continue
+            each = parent[name]
+            address = h5py.h5o.get_info(each.id).addr
+            if address in seen:  # a group may contain itself
+                continue
+            seen.add(address)
+            if len(seen) > MAX_VARIABLES:
+                raise DatasetError(
+                    f"{path}: expected at most {MAX_VARIABLES} variables; found more", code="file.variables.too_many"
+                )
+            if isinstance(each, h5py.Dataset) and each.shape is not None and _has_values(each.dtype):
+                yield prefix + name, each
+            elif isinstance(each, h5py.Group):
+                if depth == DEEPEST:
+                    raise DatasetError(
+                        f"{path}: is damaged, or malicious: expected at most {DEEPEST} levels of groups; found more",
+                        code="file.malicious",
+                    )
+                yield from inside(each, f"{prefix}{name}/", depth + 1)
+
+    return dict(inside(group, "", 1))
+
+
+def check_datasets(path: Path, datasets: Mapping[str, h5py.Dataset]) -> None:
+    """Refuse datasets of `datasets_in` that refer to other files, or whose sizes are out of proportion.
+
+    Raises
+    ------
+    DatasetError
+        With all reasons in one message.
+    """
+    size, total, messages = path.stat().st_size, 0, []
+    for name, each in datasets.items():
+        if each.external or each.is_virtual:
+            messages.append(f"{name!r:.100}: expected values in this file; found a reference to another one")
+        chunk = math.prod(each.chunks or (0,))
+        total += max(_number(each.shape), chunk) * each.dtype.itemsize
+    if not messages and total <= _most(size):
+        messages = [f"{name!r:.100}: {text}" for name, each in datasets.items() for text in violations(each)]
+    _raise(path, messages, total, size)
+
+
+def _has_values(kind: np.dtype[Any]) -> bool:
+    return not kind.hasobject and (kind.names is not None or kind.base.kind in "biufSUM")
 
 
 def check_classic(path: Path) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import math
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from errormotion.arrays import Array
+from errormotion.datasets.files.containers import check_classic, check_datasets, datasets_in, is_inside
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.tables.format import Format
 from errormotion.datasets.tables.table import Cells, Table
@@ -17,6 +21,14 @@ from errormotion.errors import DatasetError
 
 MAX_VALUES = 1 << 28
 """Largest number of values of a file."""
+MAX_UNPACKED = 1 << 30
+"""Largest size of the compressed variables of a MATLAB file when unpacked, bytes."""
+_COMPRESSED = 15
+"""Type of a compressed element of a MATLAB file (miCOMPRESSED)."""
+_MATLAB_ARRAYS = frozenset(
+    {"double", "single", "logical", "char", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+)
+"""Classes of MATLAB whose size is stated; a cell or a structure may contain any number of values."""
 
 
 class ArrayCells(Cells):
@@ -108,7 +120,8 @@ def _tdms(path: Path, form: Format) -> Columns:
                 code="file.sheet.several",
             )
         channels = groups[0].channels() if groups else []
-        if sum(len(channel) for channel in channels) > MAX_VALUES:
+        # A value has at least one bit in the file (digital lines share bytes).
+        if sum(len(channel) for channel in channels) > min(MAX_VALUES, 8 * path.stat().st_size):
             raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="file.too_large")
         for channel in channels:
             columns[channel.name] = channel[:]
@@ -126,33 +139,78 @@ def _tdms(path: Path, form: Format) -> Columns:
 def _matlab(path: Path, _form: Format) -> Columns:
     from scipy.io import loadmat, whosmat
 
-    sizes = {name: shape for name, shape, _ in whosmat(path)}
-    if sum(int(np.prod(shape)) for shape in sizes.values()) > MAX_VALUES:
+    _require_small(path)
+    sizes = {name: shape for name, shape, kind in whosmat(path) if kind in _MATLAB_ARRAYS}
+    if sum(math.prod(shape) for shape in sizes.values()) > MAX_VALUES:
         raise DatasetError(f"{path}: expected at most {MAX_VALUES} values; found more", code="file.too_large")
-    return _columns({name: array for name, array in loadmat(path).items() if not name.startswith("__")}), {}, []
+    if not sizes:  # loadmat would read all variables
+        return {}, {}, []
+    arrays = loadmat(path, variable_names=list(sizes))
+    return _columns({name: arrays[name] for name in sizes if name in arrays}), {}, []
+
+
+def _require_small(path: Path) -> None:
+    """Raise DatasetError if the compressed elements of a MATLAB file contain more than `MAX_UNPACKED`."""
+    rest = MAX_UNPACKED
+    with path.open("rb") as file:
+        head = file.read(128)
+        order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
+        if order is None:
+            return  # of version 4, which does not compress
+        while len(tag := file.read(8)) == 8:
+            kind, length = struct.unpack(f"{order}II", tag)
+            after = file.tell() + length
+            unpacking = zlib.decompressobj()
+            while kind == _COMPRESSED and file.tell() < after and not unpacking.eof:
+                packed = file.read(min(1 << 20, after - file.tell()))
+                if not packed:
+                    break
+                while packed and not unpacking.eof:
+                    rest -= len(unpacking.decompress(packed, 1 << 20))
+                    packed = unpacking.unconsumed_tail
+                    if rest < 0:
+                        raise DatasetError(
+                            f"{path}: expected at most {MAX_UNPACKED} bytes when unpacked; found more",
+                            code="file.too_large",
+                        )
+            file.seek(after)
 
 
 def _hdf5(path: Path, form: Format) -> Columns:
     import h5py  # type: ignore[import-untyped]
 
-    found: dict[str, Any] = {}
-    units: dict[str, str] = {}
     with h5py.File(path, "r") as file:
-        group = file[form.sheet] if form.sheet else file
+        group = file
+        for part in form.sheet.split("/") if form.sheet else ():
+            if not is_inside(group, part) or not isinstance(group[part], h5py.Group):
+                names = [name for name in group if is_inside(group, name)]
+                raise DatasetError(
+                    f"{path}: no group '{form.sheet}' in this file; {nearest(part, names)}", code="file.sheet.unknown"
+                )
+            group = group[part]
+        found = datasets_in(path, group)
+        check_datasets(path, found)
+        units = {name: _unit(each) for name, each in found.items()}
+        return _columns({name: each[()] for name, each in found.items()}), units, []
 
-        def take(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and item.shape is not None and item.size <= MAX_VALUES:
-                found[name] = item[()]
-                unit = item.attrs.get("units", item.attrs.get("unit", ""))
-                units[name] = unit.decode() if isinstance(unit, bytes) else str(unit)
 
-        group.visititems(take)
-    return _columns(found), units, []
+def _unit(dataset: Any) -> str:
+    """Return the unit of a dataset of HDF5: an attribute that is one text."""
+    import h5py
+
+    for name in ("units", "unit"):
+        if name in dataset.attrs:
+            stated = h5py.h5a.open(dataset.id, name.encode())
+            if stated.get_type().get_class() == h5py.h5t.STRING and math.prod(stated.shape) == 1:
+                unit = np.asarray(dataset.attrs[name]).reshape(-1)[0]
+                return unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+    return ""
 
 
 def _netcdf3(path: Path, _form: Format) -> Columns:
     from scipy.io import netcdf_file
 
+    check_classic(path)
     found: dict[str, Any] = {}
     units: dict[str, str] = {}
     with netcdf_file(path, "r", mmap=False) as file:
