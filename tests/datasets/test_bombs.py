@@ -7,6 +7,7 @@ import time
 import tracemalloc
 import zlib
 from pathlib import Path
+from zipfile import ZipFile
 
 import h5py
 import numpy as np
@@ -14,12 +15,13 @@ import pytest
 import xarray as xr
 from coded import raises
 from numcodecs import Blosc, Zstd
+from openpyxl import Workbook
 from scipy.io import savemat
 
 from errormotion.datasets.files.containers import check_netcdf
 from errormotion.datasets.files.hdf5 import Stored
 from errormotion.datasets.storage.disk import load, save
-from errormotion.datasets.tables import binary
+from errormotion.datasets.tables import binary, sheets
 from errormotion.datasets.tables.format import Format
 from errormotion.datasets.tables.reading import read_table
 from errormotion.errors import DatasetError
@@ -398,3 +400,53 @@ def test_a_small_file_of_matlab_or_netcdf3_does_not_unpack_to_gigabytes(tmp_path
     packed = b"".join(packer.compress(piece) for _ in range((binary.MAX_UNPACKED >> 20) + 2)) + packer.flush()
     path.write_bytes(path.read_bytes() + struct.pack("<II", 15, len(packed)) + packed)
     refuse_table(path, "file.too_large")
+
+
+def sheet(path: Path, cells: str) -> None:
+    """Write a spreadsheet with the cells of one sheet, as XML."""
+    begin, home = '<?xml version="1.0" encoding="UTF-8"?>', "http://schemas.openxmlformats.org"
+    main, of_office = f"{home}/spreadsheetml/2006/main", f"{home}/officeDocument/2006/relationships"
+    links = f'{begin}<Relationships xmlns="{home}/package/2006/relationships"><Relationship Id="a" '
+    with ZipFile(path, "w") as file:
+        file.writestr(
+            "_rels/.rels", f'{links}Type="{of_office}/officeDocument" Target="xl/workbook.xml"/></Relationships>'
+        )
+        file.writestr(
+            "xl/workbook.xml",
+            f'{begin}<workbook xmlns="{main}" xmlns:r="{of_office}"><sheets><sheet name="s" sheetId="1" r:id="a"/>'
+            "</sheets></workbook>",
+        )
+        file.writestr(
+            "xl/_rels/workbook.xml.rels",
+            f'{links}Type="{of_office}/worksheet" Target="worksheets/sheet1.xml"/></Relationships>',
+        )
+        file.writestr(
+            "xl/worksheets/sheet1.xml",
+            f'{begin}<worksheet xmlns="{main}"><sheetData>{cells}</sheetData></worksheet>',
+        )
+
+
+TABLE = "".join(f'<row r="{k}"><c r="A{k}"><v>{k}</v></c><c r="B{k}"><v>{2 * k}</v></c></row>' for k in range(1, 9))
+LAST = '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row>'
+
+
+@pytest.mark.parametrize("cells", [TABLE + LAST, LAST])
+def test_two_cells_of_a_spreadsheet_do_not_need_terabytes(tmp_path: Path, cells: str) -> None:
+    """The library ends the process: a failure is the end of all tests."""
+    path = tmp_path / "a.xlsx"
+    sheet(path, TABLE)
+    assert len(read_table(path).lines) == 8
+    sheet(path, cells)
+    refuse_table(path, "file.too_large")
+
+
+def test_the_cells_of_all_sheets_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sheets, "MAX_CELLS", 17)
+    book = Workbook()
+    for each in (book.active, book.create_sheet("b")):
+        for k in range(5):
+            each.append([k, 2 * k])
+    book.save(tmp_path / "a.xlsx")
+    assert read_table(tmp_path / "a.xlsx", Format(sheet="b")).titles == ["1", "2"]
+    monkeypatch.setattr(sheets, "MAX_CELLS", 19)
+    refuse_table(tmp_path / "a.xlsx", "file.too_large")

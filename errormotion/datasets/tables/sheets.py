@@ -16,13 +16,12 @@ from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.tables import recognition
 from errormotion.datasets.tables.format import Format
 from errormotion.datasets.tables.numbers import signs
+from errormotion.datasets.tables.sheet_cells import MAX_CELLS, count_cells
 from errormotion.datasets.tables.table import Cells, Table, named, same
 from errormotion.errors import DatasetError
 
 MAX_UNPACKED = 1 << 29
 """Largest sum of the sizes of the parts of a packed file, bytes."""
-MAX_CELLS = 20_000_000
-"""Largest number of cells of a sheet."""
 
 
 def sheet_table(data: bytes, path: Path, form: Format) -> Table:
@@ -56,6 +55,7 @@ def sheet_tables(data: bytes, path: Path, form: Format) -> list[Table]:
     try:
         if data.startswith(b"PK"):
             _require_small(data, path)
+        _require_few(data, path, form.sheet)
         book = CalamineWorkbook.from_filelike(io.BytesIO(data))
         names = book.sheet_names
         wanted = [form.sheet] if form.sheet else names
@@ -99,12 +99,21 @@ def _require_small(data: bytes, path: Path) -> None:
                         )
 
 
+def _require_few(data: bytes, path: Path, sheet: str) -> None:
+    """Raise DatasetError if sheets have more than `MAX_CELLS` cells, or cannot be read."""
+    count = count_cells(data, sheet)
+    if isinstance(count, str):
+        raise ValueError(count)
+    if count is None or count > MAX_CELLS:
+        raise DatasetError(
+            f"{path}: expected at most {MAX_CELLS} cells, empty ones between others included; found more. Is there a "
+            "cell far from the table? Delete it",
+            code="file.too_large",
+        )
+
+
 def _table(book: object, name: str, path: Path, form: Format) -> Table | None:
     sheet = book.get_sheet_by_name(name)  # type: ignore[attr-defined]
-    if (sheet.height or 0) * (sheet.width or 0) > MAX_CELLS:
-        raise DatasetError(
-            f"{path}, sheet '{name}': expected at most {MAX_CELLS} cells; found more", code="file.too_large"
-        )
     grid = sheet.to_python(skip_empty_area=False)
     filled = [k for k, row in enumerate(grid) if k >= form.skip and any(cell not in ("", None) for cell in row)]
     kept = [k for k in filled if not (form.comment and str(grid[k][0]).startswith(form.comment))]
