@@ -259,3 +259,47 @@ def test_a_comma_of_two_meanings_is_asked(tmp_path) -> None:
     np.testing.assert_allclose(raw["temperature"].squeeze(), 20.12 + 1e-3 * np.arange(1, 6))
     with pytest.raises(DatasetError, match="no map can be proposed: The decimal sign cannot be seen"):
         write_map(propose([log]), tmp_path / "other.toml")
+
+
+@pytest.mark.parametrize(
+    ("title", "error"),
+    [
+        ("Abweichung", "EXX"),
+        ("Positionsabweichung X", "EXX"),
+        ("Istabweichung Run 1", "EXX"),
+        ("Abweichung Y", ""),
+        ("Geradheitsabweichung", ""),
+        ("Straightness deviation", ""),
+        ("Mean deviation", ""),
+        ("Deviation pitch", ""),
+    ],
+)
+def test_the_error_is_proposed_only_where_the_title_states_no_other(tmp_path, title: str, error: str) -> None:
+    text = "Achse X\n\n" + POSITIONING.replace("Abweichung", title)
+    proposed = {question.key: question.proposed for question in propose([file_of(tmp_path, text)]).questions}
+    assert proposed["columns.deviation"] == error
+
+
+def test_a_line_above_that_states_other_errors_leaves_the_error_open(tmp_path) -> None:
+    text = "Geradheit, Achse X\n\n" + POSITIONING
+    proposed = {question.key: question.proposed for question in propose([file_of(tmp_path, text)]).questions}
+    assert proposed["columns.deviation"] == ""
+
+
+@pytest.mark.parametrize(
+    "title",
+    [
+        "Standardabweichung",
+        "Standard deviation",
+        "Fehlerkompensation",
+        "Error correction",
+        "Messunsicherheit Abweichung",
+    ],
+)
+def test_what_belongs_to_a_deviation_is_not_the_deviation(tmp_path, title: str) -> None:
+    rows = [line.split(";") for line in POSITIONING.splitlines()]
+    alone = POSITIONING.replace("Abweichung", title)
+    assert propose([file_of(tmp_path, alone)]).tables[0].meanings[1] == ""
+    beside = "\n".join(f"{a};{title + ' [µm]' if k == 0 else '0,7'};{b}" for k, (a, b) in enumerate(rows))
+    proposal = propose([file_of(tmp_path, beside)])
+    assert proposal.map["columns"]["deviation"] == {"?": "Abweichung [µm]"}

@@ -11,6 +11,7 @@ import numpy as np
 
 from errormotion.arrays import Array
 from errormotion.datasets.maps.units import fitting_unit, orders, stated_unit
+from errormotion.datasets.maps.words import is_no_reading
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.tables.dates import ELAPSED, Clock
 from errormotion.datasets.tables.mistakes import Mistakes
@@ -89,7 +90,9 @@ class Content:
         return fitting_unit(self.unit, row, freedom) if self.unit else ""
 
     def may_be(self, row: Row) -> bool:
-        """Return whether the stated unit, if there is one, does not contradict a variable."""
+        """Return whether neither the title nor the stated unit, if there is one, contradicts a variable."""
+        if is_no_reading(self.title, row.name):
+            return False
         if not self.unit:
             return True
         return bool(self.unit_for(row)) if row.unit or row.units else False

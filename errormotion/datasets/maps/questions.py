@@ -13,7 +13,7 @@ from errormotion.datasets.files.tomltext import value_of
 from errormotion.datasets.maps.columns import DATES, Content
 from errormotion.datasets.maps.fit import Assigned, Fit, label_of
 from errormotion.datasets.maps.units import fitting_unit
-from errormotion.datasets.maps.words import likeness, tokens
+from errormotion.datasets.maps.words import is_positioning, likeness, states_other_errors, tokens
 from errormotion.datasets.schemas import POSITION, RawSchema, Row
 from errormotion.datasets.tables.dates import COUNTED, EXCEL, UNIX, UNIX_MS, Clock
 from errormotion.datasets.tables.mistakes import Mistakes
@@ -100,7 +100,7 @@ def questions_of(
     found = [*_columns(main), *_attributes(main, above, answers)]
     axis = answers.get("attributes.axis") or next((q.proposed for q in found if q.key == "attributes.axis"), "")
     if axis or "axis" not in main.raw.attributes:  # else asked when the axis is known
-        found += _freedoms(parts, axis)
+        found += _freedoms(parts, axis, above)
     for part in parts:
         found += [question for question in _units(part, answers) if question.key not in {each.key for each in found}]
     found += _values(main, above)
@@ -178,8 +178,11 @@ def _attribute(name: str, allowed: Sequence[str], main: Fit, above: Sequence[str
     return known[0] if len(known) == 1 else ""
 
 
-def _freedoms(parts: Sequence[Fit], axis: str) -> list[Question]:
-    """Return the question which error a deviation is, where its title does not state it."""
+def _freedoms(parts: Sequence[Fit], axis: str, above: Sequence[str]) -> list[Question]:
+    """Return the question which error a deviation is, where its title does not state it.
+
+    That along the axis itself is proposed only if no title or line above states another axis or quantity.
+    """
     for part in parts:
         each = next((each for each in part.columns if each.key.endswith(".?")), None)
         if each is None:
@@ -189,7 +192,9 @@ def _freedoms(parts: Sequence[Fit], axis: str) -> list[Question]:
         letter = axis or "X"
         dofs = [dof for dof in DOF if not each.column.unit or (lengths if dof[1] in "XYZ" else angles)]
         own = f"E{letter}{letter}"
-        proposed = own if axis in tuple("XYZ") and own[:2] in dofs else ""
+        titles = [one.column.title for one in part.columns if one.key.endswith(".?")]
+        plain = all(is_positioning(title, axis) for title in titles) and not any(map(states_other_errors, above))
+        proposed = own if axis in tuple("XYZ") and own[:2] in dofs and plain else ""
         text = {"EX": "displacement along X", "EY": "displacement along Y", "EZ": "displacement along Z"}
         text |= {"EA": "rotation about X", "EB": "rotation about Y", "EC": "rotation about Z"}
         choices = tuple(Choice(dof + letter, f"{dof}{letter}: {text[dof]}") for dof in dofs)

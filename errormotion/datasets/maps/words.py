@@ -58,8 +58,69 @@ _BACKWARD = """
 backward backwards bwd bck - – zurück rück rückwärts zurueck her down neg negativ negative decreasing
 reverse rev r b z ab minus
 """
+_CLEAR_WAYS = frozenset(
+    [
+        "forward",
+        "forwards",
+        "fwd",
+        "vorwärts",
+        "hin",
+        "increasing",
+        "backward",
+        "backwards",
+        "bwd",
+        "bck",
+        "zurück",
+        "zurueck",
+        "rück",
+        "rückwärts",
+        "decreasing",
+        "reverse",
+    ]
+)
+"""Words for a direction that have no other meaning in a title, unlike ``r`` or a hyphen."""
 WAYS = {FORWARD: frozenset(_FORWARD.split()), BACKWARD: frozenset(_BACKWARD.split())}
 """Words for the directions in which a target is approached."""
+_NO_READINGS = [
+    "uncertainty",
+    "unsicherheit",
+    "standardabw",
+    "stdabw",
+    "stddev",
+    "stdev",
+    "correction",
+    "korrektur",
+    "compensation",
+    "kompensation",
+    "tolerance",
+    "toleranz",
+    "umkehrspanne",
+]
+_NO_READING = frozenset("std sigma standard unc".split())  # noqa: SIM905
+"""Parts of words, and words, of what belongs to a quantity but is not its readings."""
+_POSITIONING = [
+    "position",
+    "pos",
+    "ist",
+    "soll",
+    "target",
+    "actual",
+    "nominal",
+    "linear",
+    "abw",
+    "abweichung",
+    "deviation",
+    "dev",
+    "fehler",
+    "error",
+    "err",
+]
+_FILLING = frozenset("run lauf zyklus cycle messung messlauf messreihe achse axis der die of in the".split())  # noqa: SIM905
+_COMPOSED = re.compile(f"(?:(?:{'|'.join(_POSITIONING)})(?:en|s)?)+")
+_OTHER_ERRORS = re.compile(
+    r"gerad|straight|rechtwink|squareness|winkel|angular|angle|pitch|yaw|roll|nick|gier|wank|parallel|ebenheit|flatness",
+    re.IGNORECASE,
+)
 _TOKEN = re.compile(r"[^\W\d_]+|[0-9]+|[+\-–]")
 
 
@@ -105,3 +166,37 @@ def way_of(text: str) -> str:
     own = tokens(text) or (text.strip().lower(),)
     found = {way for way, words in WAYS.items() for token in own if token in words}
     return found.pop() if len(found) == 1 else ""
+
+
+def is_clear_way(token: str) -> bool:
+    """Return whether a word of a title states a direction of approach and nothing else."""
+    return token in _CLEAR_WAYS
+
+
+def is_no_reading(title: str, name: str) -> bool:
+    """Return whether a title states what belongs to a variable but is not its readings, such as its uncertainty."""
+    if any(part in name for part in ("uncertainty", "correction", "compensation", "tolerance")):
+        return False
+    return any(token in _NO_READING or any(part in token for part in _NO_READINGS) for token in tokens(title))
+
+
+def is_positioning(title: str, axis: str) -> bool:
+    """Return whether a title has only words that a deviation along its own axis may have: no other axis or quantity."""
+    own = axis.lower()
+    others = set("xyzabcuvw") - {own}
+    return all(
+        token not in others
+        and (
+            token == own
+            or token.isdigit()
+            or token in _FILLING
+            or any(token in words for words in WAYS.values())
+            or _COMPOSED.fullmatch(token) is not None
+        )
+        for token in tokens(title)
+    )
+
+
+def states_other_errors(text: str) -> bool:
+    """Return whether a line states errors other than positioning, such as straightness."""
+    return _OTHER_ERRORS.search(text) is not None
