@@ -303,3 +303,73 @@ def test_what_belongs_to_a_deviation_is_not_the_deviation(tmp_path, title: str) 
     beside = "\n".join(f"{a};{title + ' [µm]' if k == 0 else '0,7'};{b}" for k, (a, b) in enumerate(rows))
     proposal = propose([file_of(tmp_path, beside)])
     assert proposal.map["columns"]["deviation"] == {"?": "Abweichung [µm]"}
+
+
+def matrix_of(titles: list[str], positions: list[int]) -> str:
+    head = ["Sollposition [mm]", *(f"{title} [µm]" for title in titles)]
+    rows = [[str(p), *(f"{k + 1},{row}" for k in range(len(titles)))] for row, p in enumerate(positions)]
+    return "Achse X\n\n" + "\n".join(map(";".join, [head, *rows])) + "\n"
+
+
+@pytest.mark.parametrize(
+    "titles",
+    [
+        [f"R{k}" for k in range(1, 7)],
+        [f"Run {k} - Deviation" for k in range(1, 7)],
+        [f"Messung {k}" for k in range(1, 7)],
+        [f"Messung {k} vor" for k in range(1, 7)],
+    ],
+)
+def test_directions_that_no_title_states_are_asked(tmp_path, titles: list[str]) -> None:
+    file = file_of(tmp_path, matrix_of(titles, [0, 100, 200]))
+    proposal = propose([file])
+    (question,) = [each for each in proposal.open if each.key == "labels.approach"]
+    assert [each.value for each in question.choices] == ["forward", "backward", "alternating"]
+    with pytest.raises(DatasetError, match=r"labels.approach: expected one of forward, backward, alternating"):
+        proposal.answered({"labels.approach": "up"})
+    write_map(accepted(proposal, {"labels.approach": "alternating", "columns.deviation": "EXX"}), tmp_path / "map.toml")
+    raw = import_files([file], tmp_path / "map.toml")
+    assert dict(raw.sizes) == {"run": 3, "approach": 2, "target": 3, "freedom": 1}
+    values = raw["deviation"].sel(approach="backward").squeeze().transpose("run", "target")
+    np.testing.assert_allclose(values[:, 0], [2e-6, 4e-6, 6e-6])
+    assert known_map([file], [tmp_path / "map.toml"]) is None
+    backward = accepted(proposal, {"labels.approach": "backward", "columns.deviation": "EXX"})
+    labels = backward.map["columns"]["deviation"]["EXX"]["labels"]
+    assert labels == {"run": [1, 2, 3, 4, 5, 6], "approach": ["backward"] * 6}
+
+
+@pytest.mark.parametrize(
+    ("titles", "ways"),
+    [
+        (["R1", "F1", "R2", "F2"], ["backward", "forward"] * 2),
+        (["Run 1 fwd", "Run 2 fwd"], ["forward"] * 2),
+        (["Run 1 - bwd", "Run 2 - bwd"], ["backward"] * 2),
+    ],
+)
+def test_directions_are_words_or_pairs_of_titles(tmp_path, titles: list[str], ways: list[str]) -> None:
+    proposal = accepted(propose([file_of(tmp_path, matrix_of(titles, [0, 100]))]), {"columns.deviation": "EXX"})
+    assert proposal.map["columns"]["deviation"]["EXX"]["labels"]["approach"] == ways
+
+
+def test_the_axis_in_a_column_is_no_direction(tmp_path) -> None:
+    rows = POSITIONING.splitlines()
+    text = "\n".join([f"Achse;{rows[0]}", *(f"Z;{row}" for row in rows[1:])])
+    proposal = propose([file_of(tmp_path, text)])
+    assert "labels" not in proposal.map
+    assert proposal.map["sequence"] == "Position [mm]"
+
+
+def test_one_pass_has_the_direction_of_its_own_positions(tmp_path) -> None:
+    """The map of a file with increasing positions reads one with decreasing ones."""
+    up = file_of(tmp_path, matrix_of(["Abweichung"], [0, 100, 200]), "up.csv")
+    down = file_of(tmp_path, matrix_of(["Abweichung"], [200, 100, 0]), "down.csv")
+    write_map(accepted(propose([up]), {}), tmp_path / "map.toml")
+    assert known_map([down], [tmp_path / "map.toml"]) == tmp_path / "map.toml"
+    for file, way in ((up, "forward"), (down, "backward")):
+        raw = import_files([file], tmp_path / "map.toml")
+        assert list(raw["approach"].values[raw["deviation"].notnull().any(("run", "target", "freedom"))]) == [way]
+
+
+def test_the_direction_of_positions_in_no_order_is_asked(tmp_path) -> None:
+    proposal = propose([file_of(tmp_path, matrix_of(["Abweichung"], [0, 200, 100]))])
+    assert [each.key for each in proposal.open] == ["labels.approach"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,10 +11,10 @@ import numpy as np
 
 from errormotion.datasets.maps.columns import DATES, EMPTY, NUMBERS, TEXTS, Content
 from errormotion.datasets.maps.form import SEQUENCE
-from errormotion.datasets.maps.words import likeness, tokens, way_of
+from errormotion.datasets.maps.words import is_clear_way, likeness, tokens, way_of
 from errormotion.datasets.schemas import RawSchema, Row
 from errormotion.datasets.tables.table import name_of
-from errormotion.datasets.text.layout import targets
+from errormotion.datasets.text.layout import BACKWARD, FORWARD, targets
 from errormotion.datasets.text.table_reader import FREEDOM, Names
 from errormotion.datasets.units import convert
 
@@ -24,6 +24,8 @@ _FREEDOM = re.compile(r"(?<![A-Za-z0-9])E[XYZABC][XYZABCUVW](?![A-Za-z0-9])", re
 _NUMBERING = frozenset("nr no number nummer index lfd sweep sample scan zeile row line # id count".split())  # noqa: SIM905
 _QUANTITIES = ("temperature", "speed", "pressure", "humidity", "time", "load", "feed")
 """Quantities that a title states on its own."""
+ALTERNATING = "alternating"
+"""Answer for columns of passes in turn, the first one forward."""
 _FEW = 50
 """Number of readings from which their interval is known."""
 _CLEAR = 2.0
@@ -75,6 +77,9 @@ class Fit:
         Required variables without a column.
     score : float
         The larger the better.
+    ways : tuple of str
+        Directions of approach of the columns side by side, of which neither titles nor positions state one; empty if
+        they are known.
     """
 
     raw: RawSchema
@@ -83,6 +88,7 @@ class Fit:
     sequence: Content | None = None
     lacking: list[Row] = field(default_factory=list)
     score: float = 0.0
+    ways: tuple[str, ...] = ()
 
     @property
     def used(self) -> set[int]:
@@ -261,6 +267,10 @@ def _ways(column: Content) -> tuple[Content, dict[str, str]] | None:
         return None
     if not names or not all(names.values()):
         return None
+    letters = any(text.strip().isalpha() and len(text.strip()) == 1 for text in names)
+    stated = likeness(column.title, "approach") >= _CLEAR and not letters
+    if len(set(names.values())) < 2 and not stated:  # a Z in all rows may be an axis
+        return None
     return column, {text: way for text, way in names.items() if text != way}
 
 
@@ -420,7 +430,7 @@ def _runs(schema: _Schema, found: Fit, rest: list[Content], lacking: Sequence[st
         return False
     number = targets(values)
     if len(set(number.tolist())) == values.size:  # a row for each target: columns are runs
-        return _matrix(schema, found, rest, place)
+        return _matrix(schema, found, rest, place, lacking)
     if set(lacking) == set(SEQUENCE):
         found.sequence = place.column
         return True
@@ -430,40 +440,75 @@ def _runs(schema: _Schema, found: Fit, rest: list[Content], lacking: Sequence[st
     return not lacking
 
 
-def _matrix(schema: _Schema, found: Fit, rest: list[Content], place: Assigned) -> bool:
+def _matrix(schema: _Schema, found: Fit, rest: list[Content], place: Assigned, lacking: Sequence[str]) -> bool:
     """Assign columns with the readings of one run and direction each, whose titles state both."""
     row = schema.mains[0]
     single = [each for each in found.columns if each.name == row.name]
     able = [each.column for each in single] + [
         column for column in rest if column.kind == NUMBERS and column.may_be(row) and _run_of(column.title)
     ]
-    runs = [_run_of(column.title) for column in able]
-    found.labels["target"] = (place.column, {})
-    if len(able) > 1 and all(runs) and len({tuple(each.items()) for each in runs if each}) == len(able):
+    runs = [_run_of(column.title) or {} for column in able]
+    if len(able) > 1 and all(runs) and len({tuple(each.items()) for each in runs}) == len(able):
+        if not _certain(able, runs):
+            if len({each["run"] for each in runs}) < len(able):
+                return False
+            numbered = sorted(int(each["run"]) for each in runs) == list(range(1, len(runs) + 1))
+            found.ways = (FORWARD, BACKWARD, *((ALTERNATING,) if numbered and len(runs) % 2 == 0 else ()))
+            runs = [{"run": each["run"], "approach": "?"} for each in runs]
+        found.labels["target"] = (place.column, {})
         key = single[0].key if single and single[0].sure else f"{row.name}.?"
         found.columns = [each for each in found.columns if each.name != row.name]
         for column, labels in sorted(zip(able, runs, strict=True), key=lambda each: each[0].index):
             if column in rest:
                 rest.remove(column)
-            found.columns.append(Assigned(column, key, dict(labels or {}), sure=not key.endswith("?")))
+            found.columns.append(Assigned(column, key, dict(labels), sure=not key.endswith("?")))
         return True
-    if len(single) == 1:  # one run in one direction
-        single[0].labels = {"run": 1, "approach": "forward"}
-        values = place.column.values
-        if values[0] > values[-1]:
-            single[0].labels["approach"] = "backward"
+    if len(single) != 1:
+        return False
+    steps = np.diff(place.column.values)
+    if set(lacking) == set(SEQUENCE) and steps.size and ((steps > 0).all() or (steps < 0).all()):
+        found.sequence = place.column  # one run in one direction, which each file of this kind states by itself
         return True
-    return False
+    found.labels["target"] = (place.column, {})
+    stated: dict[str, str | int] = {"run": 1, "approach": "?"}
+    single[0].labels = {dim: label for dim, label in stated.items() if dim in lacking}
+    if "approach" in lacking:
+        found.ways = (FORWARD, BACKWARD)
+    return True
+
+
+def _certain(columns: Sequence[Content], runs: Sequence[Mapping[str, str | int]]) -> bool:
+    """Return whether the titles of columns state their directions: a run in both, or a word of no other meaning.
+
+    A letter or a sign alone may mean something else: R1 is a first run, and a hyphen separates words.
+    """
+    if not all("approach" in each for each in runs):
+        return False
+    pair = len({each["run"] for each in runs}) < len(runs)
+    return pair or all(any(map(is_clear_way, tokens(column.title))) for column in columns)
 
 
 def _run_of(title: str) -> dict[str, str | int] | None:
-    """Return run and approach that a title such as ``Run 2 -`` or ``1 vor`` states."""
+    """Return run and, if there is one, the approach that a title such as ``Run 2 -`` or ``1 vor`` states."""
     own = tokens(title)
     numbers = [int(token) for token in own if token.isdigit()]
-    ways = {way for token in own if not token.isdigit() and (way := way_of(token))}
+    words = [token for token in own if not token.isdigit()]
+    ways = {way for token in words if is_clear_way(token) and (way := way_of(token))}
+    ways = ways or {way for token in words if (way := way_of(token))}
     if len(numbers) != 1 or len(ways) > 1:
         return None
-    return {"run": numbers[0], "approach": ways.pop() if ways else "forward"}
+    return {"run": numbers[0]} | ({"approach": ways.pop()} if ways else {})
+
+
+def approached(found: Fit, answer: str) -> None:
+    """Set the directions of approach of columns by an answer: one of ``found.ways``."""
+    for each in found.columns:
+        if each.labels.get("approach") != "?":
+            continue
+        each.labels["approach"] = answer
+        if answer == ALTERNATING:
+            number = int(each.labels["run"])
+            each.labels |= {"run": (number + 1) // 2, "approach": FORWARD if number % 2 else BACKWARD}
 
 
 def _wide(schema: _Schema, found: Fit, rest: list[Content], lacking: Sequence[str]) -> bool:

@@ -13,8 +13,8 @@ from errormotion import plugins
 from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.maps.columns import Content, contents
 from errormotion.datasets.maps.content import map_of
-from errormotion.datasets.maps.fit import Fit, fit, further
-from errormotion.datasets.maps.questions import Choice, Question, is_column, questions_of
+from errormotion.datasets.maps.fit import Fit, approached, fit, further
+from errormotion.datasets.maps.questions import APPROACH, Choice, Question, is_column, questions_of
 from errormotion.datasets.maps.reading import kind_of
 from errormotion.datasets.schemas import RawSchema, raw_schemas
 from errormotion.datasets.tables.format import Format
@@ -183,7 +183,8 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
         questions = [Question("raw", "Which kind of measurement is this?", candidates, proposed, True), *questions]
     _refuse_unknown(new, questions, parts)
     tables = [parts[0].columns[0].column.table, *(each.columns[0].column.table for each in parts[1:])]
-    content = map_of(parts, state.answers, questions, kind_of(tables), form)
+    kind = "" if chosen.ways else kind_of(tables)  # a direction that the file does not state is asked for each one
+    content = map_of(parts, state.answers, questions, kind, form)
     by_table = {id(each.columns[0].column.table): each for each in parts}
     previews = []
     notes = []
@@ -243,6 +244,8 @@ def _fits(state: _State) -> list[tuple[Fit, int]]:
 def _parts(state: _State, chosen: Fit, main: int) -> list[Fit]:
     """Return the columns of all tables: of the readings, and of those with variables that they lack."""
     parts = [_corrected(chosen, state.columns[main], state.answers)]
+    if (way := state.answers.get(APPROACH, "")) in chosen.ways:
+        approached(chosen, way)
     there = {each.name for each in chosen.columns} - {"time"}
     for k, columns in enumerate(state.columns):
         if k == main:
@@ -285,7 +288,9 @@ def _refuse_unknown(new: Iterable[str], questions: Sequence[Question], parts: Se
     rows = {row.name for row in (*raw.rows, *raw.stated)}
     for key in new:
         head, _, name = key.partition(".")
-        known = key in ("raw", "machine") or key in {each.key for each in questions}
+        known = key in ("raw", "machine", *((APPROACH,) if parts[0].ways else ())) or key in {
+            each.key for each in questions
+        }
         known |= head in ("columns", "units", "values") and name.partition(".")[0] in rows
         known |= head in ("attributes", "format") and bool(name)
         if not known:

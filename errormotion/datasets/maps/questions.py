@@ -11,7 +11,7 @@ import numpy as np
 
 from errormotion.datasets.files.tomltext import value_of
 from errormotion.datasets.maps.columns import DATES, Content
-from errormotion.datasets.maps.fit import Assigned, Fit, label_of
+from errormotion.datasets.maps.fit import ALTERNATING, Assigned, Fit, label_of
 from errormotion.datasets.maps.units import fitting_unit
 from errormotion.datasets.maps.words import is_positioning, likeness, states_other_errors, tokens
 from errormotion.datasets.schemas import POSITION, RawSchema, Row
@@ -24,6 +24,8 @@ from errormotion.datasets.text.table_reader import Found, Names
 from errormotion.errors import DatasetError
 from errormotion.kinematics.iso import DOF
 
+APPROACH = "labels.approach"
+"""Key of the question for the direction of approach."""
 UNITS = {
     "m": ("mm", "um", "nm", "m", "inch"),
     "rad": ("arcsec", "deg", "um/m", "mrad", "urad", "rad"),
@@ -97,7 +99,7 @@ def questions_of(
         An answer is wrong.
     """
     main = parts[0]
-    found = [*_columns(main), *_attributes(main, above, answers)]
+    found = [*_columns(main), *_approach(main), *_attributes(main, above, answers)]
     axis = answers.get("attributes.axis") or next((q.proposed for q in found if q.key == "attributes.axis"), "")
     if axis or "axis" not in main.raw.attributes:  # else asked when the axis is known
         found += _freedoms(parts, axis, above)
@@ -127,6 +129,17 @@ def _columns(main: Fit) -> list[Question]:
         text = f"Which column is {each.key.replace('.', ' ')}?"
         found.append(Question(f"columns.{each.key}", text, choices, place_of(each.column), True))
     return found
+
+
+def _approach(main: Fit) -> list[Question]:
+    """Return the question in which direction the targets were approached, if neither titles nor positions state it."""
+    if not main.ways:
+        return []
+    titles = [each.column.title for each in main.columns if "approach" in each.labels]
+    texts = {ALTERNATING: "in turn: 1 forward, 2 backward, 3 forward, and so on"}
+    choices = tuple(Choice(way, texts.get(way, f"{way} in all of them")) for way in main.ways)
+    listed = ", ".join(f"'{title}'" for title in titles)
+    return [Question(APPROACH, f"In which direction were the targets approached in {listed}?", choices, "", True)]
 
 
 def place_of(column: Content) -> str:

@@ -58,65 +58,26 @@ _BACKWARD = """
 backward backwards bwd bck - – zurück rück rückwärts zurueck her down neg negativ negative decreasing
 reverse rev r b z ab minus
 """
-_CLEAR_WAYS = frozenset(
-    [
-        "forward",
-        "forwards",
-        "fwd",
-        "vorwärts",
-        "hin",
-        "increasing",
-        "backward",
-        "backwards",
-        "bwd",
-        "bck",
-        "zurück",
-        "zurueck",
-        "rück",
-        "rückwärts",
-        "decreasing",
-        "reverse",
-    ]
-)
+_UNMISTAKABLE = """
+forward forwards fwd vorwärts hin increasing backward backwards bwd bck zurück zurueck rück rückwärts decreasing reverse
+"""
+_CLEAR_WAYS = frozenset(_UNMISTAKABLE.split())
 """Words for a direction that have no other meaning in a title, unlike ``r`` or a hyphen."""
 WAYS = {FORWARD: frozenset(_FORWARD.split()), BACKWARD: frozenset(_BACKWARD.split())}
 """Words for the directions in which a target is approached."""
-_NO_READINGS = [
-    "uncertainty",
-    "unsicherheit",
-    "standardabw",
-    "stdabw",
-    "stddev",
-    "stdev",
-    "correction",
-    "korrektur",
-    "compensation",
-    "kompensation",
-    "tolerance",
-    "toleranz",
-    "umkehrspanne",
-]
-_NO_READING = frozenset("std sigma standard unc".split())  # noqa: SIM905
+_PROPERTIES = """
+uncertainty unsicherheit standardabw stdabw stddev stdev correction korrektur compensation kompensation tolerance
+toleranz umkehrspanne
+"""
+_NO_READINGS = tuple(_PROPERTIES.split())
+_NO_READING = frozenset({"std", "sigma", "standard", "unc"})
 """Parts of words, and words, of what belongs to a quantity but is not its readings."""
-_POSITIONING = [
-    "position",
-    "pos",
-    "ist",
-    "soll",
-    "target",
-    "actual",
-    "nominal",
-    "linear",
-    "abw",
-    "abweichung",
-    "deviation",
-    "dev",
-    "fehler",
-    "error",
-    "err",
-]
-_FILLING = frozenset("run lauf zyklus cycle messung messlauf messreihe achse axis der die of in the".split())  # noqa: SIM905
-_COMPOSED = re.compile(f"(?:(?:{'|'.join(_POSITIONING)})(?:en|s)?)+")
+_POSITIONING = "position|pos|ist|soll|target|actual|nominal|linear|abw|abweichung|deviation|dev|fehler|error|err"
+_FILLERS = """
+run lauf zyklus cycle messung messlauf messreihe achse axis der die of in the
+"""
+_FILLING = frozenset(_FILLERS.split())
+_COMPOSED = re.compile(f"(?:(?:{_POSITIONING})(?:en|s)?)+")
 _OTHER_ERRORS = re.compile(
     r"gerad|straight|rechtwink|squareness|winkel|angular|angle|pitch|yaw|roll|nick|gier|wank|parallel|ebenheit|flatness",
     re.IGNORECASE,
