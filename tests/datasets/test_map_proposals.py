@@ -190,7 +190,8 @@ def test_temperatures_of_a_second_file_belong_to_the_readings(tmp_path) -> None:
 
 def test_open_questions_stand_in_the_written_map(tmp_path) -> None:
     text = text_of(propose([file_of(tmp_path, SENSORS)]))
-    assert "# TO STATE units.distance: Which unit has column 'Sensor 1'? One of mm, um, nm, m, inch" in text
+    asked = "Which unit has each of the columns 'Sensor 1', 'Sensor 2', 'Sensor 3', 'Sensor 4', 'Sensor 5'?"
+    assert f"# TO STATE units.distance: {asked} One of mm, um, nm, m, inch" in text
     assert "# bar_radius =   # needed: radius of the bar at the side beams, m" in text
 
 
@@ -373,3 +374,39 @@ def test_one_pass_has_the_direction_of_its_own_positions(tmp_path) -> None:
 def test_the_direction_of_positions_in_no_order_is_asked(tmp_path) -> None:
     proposal = propose([file_of(tmp_path, matrix_of(["Abweichung"], [0, 200, 100]))])
     assert [each.key for each in proposal.open] == ["labels.approach"]
+
+
+def test_an_answered_unit_is_that_of_the_columns_without_one(tmp_path) -> None:
+    text = matrix_of(["Run 1 fwd", "Run 1 bwd"], [0, 100]).replace("Run 1 fwd [µm]", "Run 1 fwd")
+    file = file_of(tmp_path, text.replace("Run 1 bwd [µm]", "Run 1 bwd [mm]"))
+    proposal = propose([file])
+    assert {each.key: each.proposed for each in proposal.questions}["units.deviation"] == ""
+    write_map(accepted(proposal, {"units.deviation": "um", "columns.deviation": "EXX"}), tmp_path / "map.toml")
+    values = import_files([file], tmp_path / "map.toml")["deviation"].isel(target=0).squeeze()
+    np.testing.assert_allclose(values.sel(approach=["forward", "backward"]), [1e-6, 2e-3])
+
+
+def test_a_unit_beside_others_is_asked_and_kept(tmp_path) -> None:
+    file = file_of(tmp_path, "Zeit [s];T1;T2 [°F]\n" + "".join(f"{60 * k};20;68\n" for k in range(5)))
+    (question,) = (each for each in propose([file]).questions if each.key == "units.temperature")
+    assert (question.text, question.proposed) == ("Which unit has column 'T1'?", "")
+    write_map(accepted(propose([file]), {"units.temperature": "degC"}), tmp_path / "map.toml")
+    values = import_files([file], tmp_path / "map.toml")["temperature"].isel(time=0)
+    np.testing.assert_allclose(values, 20.0)
+
+
+def test_a_unit_of_the_map_beside_another_one_of_the_file_is_refused(tmp_path) -> None:
+    file = file_of(tmp_path, POSITIONING)
+    write_map(accepted(propose([file]), X), tmp_path / "map.toml")
+    text = (tmp_path / "map.toml").read_text("utf-8")
+    (tmp_path / "map.toml").write_text(text + '\n[units]\ndeviation = "nm"\n', encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"units.deviation: file.csv states the unit .*expected no other one; found"):
+        import_files([file], tmp_path / "map.toml")
+
+
+def test_columns_of_one_variable_in_other_units(tmp_path) -> None:
+    text = matrix_of(["Run 1 fwd", "Run 1 bwd"], [0, 100]).replace("Run 1 bwd [µm]", "Run 1 bwd [nm]")
+    file = file_of(tmp_path, text)
+    write_map(accepted(propose([file]), {"columns.deviation": "EXX"}), tmp_path / "map.toml")
+    values = import_files([file], tmp_path / "map.toml")["deviation"].isel(target=0).squeeze()
+    np.testing.assert_allclose(values.sel(approach=["forward", "backward"]), [1e-6, 2e-9])

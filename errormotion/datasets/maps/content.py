@@ -99,7 +99,8 @@ def _part(part: Fit, given: Mapping[str, str]) -> dict[str, Any]:
         if group[0].minus is not None and not stated:  # the unit of the column that is subtracted
             other = next((each.name for each in part.columns if each.column.index == group[0].minus.index), "")
             stated = given.get(f"units.{other}", "")
-        if stated and (len(group[0].column.dates) > 1 or not group[0].column.unit_for(rows[name])):
+        open_ = any(len(each.column.dates) > 1 or not each.column.unit_for(rows[name]) for each in group)
+        if stated and open_:  # of the columns without a unit of their own
             units[name] = stated
     if units:
         own["units"] = units

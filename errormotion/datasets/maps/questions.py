@@ -241,7 +241,13 @@ def _units(part: Fit, answers: Mapping[str, str]) -> list[Question]:
             kinds = ("m",) if freedom[1] in "XYZ" else ("rad",)
         units = [unit for kind in kinds for unit in UNITS.get(kind, (kind,))]
         choices = tuple(Choice(unit, _in(each.column, unit)) for unit in units)
-        found[key] = Question(key, f"Which unit has {title}?", choices, _unit(each.column, row), True)
+        columns = [one.column for one in part.columns if one.name == each.name and one.minus is None]
+        open_ = [column for column in columns if not column.unit_for(row)]
+        if len(open_) > 1:
+            title = "each of the columns " + ", ".join(f"'{column.title}'" for column in open_)
+        same_units = len(open_) == len(columns)  # else the unit beside it may be meant, or not
+        proposed = _unit(each.column, row) if same_units else ""
+        found[key] = Question(key, f"Which unit has {title}?", choices, proposed, True)
     return list(found.values())
 
 

@@ -152,11 +152,11 @@ def _unit(
 ) -> str:
     base = base_key(key)
     name, _, label = base.partition(".")
-    stated = entry.unit or part.units.get(base, "") or part.units.get(name, "")
     row = rows.get(name)
+    freedom = label if name in labelled else ""
+    stated = entry.unit or _of_map(key, part, table, row, freedom, mistakes)
     if row is None:
         return stated
-    freedom = label if name in labelled else ""
     if stated:
         return stated if is_date(stated) else fitting_unit(stated, row, freedom) or stated
     places = entry.column if isinstance(entry.column, list) else [entry.column]
@@ -188,6 +188,35 @@ def _unit(
         )
         return row.unit
     return fitting_unit(unit, row, freedom) or unit
+
+
+def _of_map(key: str, part: MapTable, table: Table, row: Row | None, freedom: str, mistakes: Mistakes) -> str:
+    """Return the unit of a column by ``units`` of a map; empty for a column whose unit the file states.
+
+    Another unit than that of the file is a mistake if ``units`` serves no column without one.
+    """
+    base = base_key(key)
+    name = base if base in part.units else base.partition(".")[0]
+    stated = part.units.get(name, "")
+    if not stated or row is None or is_date(stated):
+        return stated
+    own = _of_file(key, part, table, row, freedom)
+    if not own or own == fitting_unit(stated, row, freedom):
+        return stated
+    served = [each for each in part.columns if base_key(each) == name or base_key(each).partition(".")[0] == name]
+    if all(_of_file(each, part, table, row, freedom) for each in served):
+        mistakes.add(
+            0, f"units.{name}: {table.path.name} states the unit {own}; expected no other one; found '{stated}'"
+        )
+    return ""
+
+
+def _of_file(key: str, part: MapTable, table: Table, row: Row, freedom: str) -> str:
+    """Return the unit that a file states for a column, if it is one of the variable; else empty."""
+    place = part.columns[key].column
+    before = Mistakes(table.path)
+    where = table.place(place[0] if isinstance(place, list) else place, key, before)
+    return "" if before.count else fitting_unit(stated_unit(table, where), row, freedom)
 
 
 def _check_difference(key: str, entry: MappedColumn, table: Table, mistakes: Mistakes) -> None:

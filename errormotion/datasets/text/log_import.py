@@ -78,6 +78,10 @@ def checked_columns(settings: LogMap, names: Names, mistakes: Mistakes) -> dict[
     """Return the columns of a map by variable and component; mistakes for those that the schema does not have."""
     checked = {where: _column(where, entry, names, mistakes) for where, entry in settings.columns.items()}
     dims = {dim for row in names.rows.values() for dim in names.record_dims(row)}
+    for where, entry in settings.columns.items():
+        last = settings.entries[base_key(where)][-1]
+        if (entry.scale, entry.offset) != (last.scale, last.offset):
+            mistakes.add(0, f"columns.{where}: expected the scale and offset of the other columns of {base_key(where)}")
     stated = {f"labels.{dim}": dim for dim in settings.labels}
     stated |= {f"columns.{key}.labels.{dim}": dim for key, each in settings.columns.items() for dim in each.labels}
     for where, dim in stated.items():
@@ -290,7 +294,10 @@ def _columns(table: Table, settings: LogMap, mistakes: Mistakes) -> _Columns:
         if where.startswith("columns"):
             if minus := places.get(f"minus.{where.partition('.')[2]}"):
                 numbers[k] = numbers[k] - values[minus[0]]
-            columns.setdefault(base_key(where.partition(".")[2]), []).append(k)
+            key = where.partition(".")[2]
+            if where not in dated:
+                numbers[k] = _in_one_unit(key, numbers[k], settings, mistakes)
+            columns.setdefault(base_key(key), []).append(k)
     heads = [table.titles[where[0]] for where in places.values()]
     if settings.sequence is not None and not mistakes.count:
         positions = numbers[list(places).index("sequence")]
@@ -304,6 +311,18 @@ def _columns(table: Table, settings: LogMap, mistakes: Mistakes) -> _Columns:
         unit = "s" if "columns.time" in clocks else settings.columns["time"].unit
         notes += holes(np.asarray(convert(numbers[columns["time"][0]], unit, "s"), dtype=float), table.lines)
     return _Columns(Cells((table.head, heads), table.lines, texts, numbers), keys, columns, start, notes)
+
+
+def _in_one_unit(key: str, numbers: Array, settings: LogMap, mistakes: Mistakes) -> Array:
+    """Return the numbers of a column in the unit of the last one of its variable, with which all of them are read."""
+    own, last = settings.columns[key], settings.entries[base_key(key)][-1]
+    if own.unit == last.unit:
+        return numbers
+    try:
+        return np.asarray(convert(numbers, own.unit, last.unit), dtype=float)
+    except DatasetError:
+        mistakes.add(0, f"columns.{key}.unit: expected a unit of the kind of {last.unit}; found '{own.unit}'")
+        return numbers
 
 
 def _missing_rows(table: Cells, keys: Mapping[str, int]) -> list[str]:
