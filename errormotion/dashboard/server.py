@@ -22,8 +22,8 @@ from errormotion.dashboard.door import Door, Server, listeners
 from errormotion.dashboard.lab import Lab
 from errormotion.dashboard.pages import adding, compare, compensate, measure, now, results
 from errormotion.dashboard.pages.login import Login
-from errormotion.dashboard.pages.page import Context, Guarded, note_request
-from errormotion.dashboard.uploads import MAX_UPLOAD
+from errormotion.dashboard.pages.page import NO_CONTROL, Context, Guarded, note_request
+from errormotion.dashboard.uploads import MAX_UPLOAD, Uploads
 from errormotion.dashboard.watch import Watch
 from errormotion.errors import RunError
 
@@ -153,8 +153,11 @@ def door_of(context: Context, served: Application) -> Door:
     """Return the door of an application: requests with a body are refused by their header."""
 
     def refusal(method: str, path: str, headers: HTTPHeaders) -> tuple[int, str] | None:
+        if path == adding.UPLOAD and not context.control:
+            return 403, NO_CONTROL
         session = _cookie(headers.get("Cookie", ""), context.cookie)
-        return context.access.refusal(method, headers, session, public=path == LOGIN, controls=False)
+        large = path == adding.UPLOAD  # only for those who may write
+        return context.access.refusal(method, headers, session, public=path == LOGIN, controls=large)
 
     longest = {LOGIN: MAX_LOGIN, adding.UPLOAD: MAX_UPLOAD}
     return Door(served, refusal, lambda path: longest.get(path, MAX_REQUEST))
@@ -217,6 +220,8 @@ async def serve(options: Options, started: Callable[[str, Access], None], end: a
         server.add_sockets(sockets)
         if watch is not None:
             watch.start()
+        if options.control:
+            await asyncio.to_thread(Uploads(options.runs).clean)
         try:
             started(_address(options, port), access)
             await (end or asyncio.Event()).wait()

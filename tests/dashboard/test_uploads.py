@@ -1,6 +1,8 @@
 """Files that a browser sends: bounded, confined to the folder of runs, shown as a table, and added as a run."""
 
 import json
+import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,14 @@ from coded import raises
 pytest.importorskip("bokeh", reason="pip install 'errormotion[dashboard]'")
 
 from errormotion.campaign.folder import RunFolder
-from errormotion.dashboard import uploads
+from errormotion.dashboard import door, uploads
+from errormotion.dashboard.access import CONTROL_HEADER
 from errormotion.dashboard.pages import adding
 from errormotion.dashboard.uploads import Uploads
 
 MARCH = 1_772_438_400
 """2026-03-02 08:00 UTC, s."""
-ORDERS = [adding.UPLOAD, "/results/add/table.json", "/results/add/save"]
+ORDERS = [adding.UPLOAD, "/results/add/table.json", "/results/add/save", "/results/add/cancel"]
 
 
 def positioning(axis: str = "X") -> str:
@@ -107,11 +110,79 @@ def test_a_file_that_is_too_large_is_refused(controlling: Any, monkeypatch: pyte
     assert post(controlling, "/results/add/table.json", **large)[0] == 400
 
 
-def test_uploads_are_few_and_the_oldest_is_removed(tmp_path: Path) -> None:
+def test_uploads_are_few_and_none_in_use_is_removed(tmp_path: Path) -> None:
     found = Uploads(tmp_path / "runs")
-    keys = [found.store("", "a.csv", b"1") for _ in range(uploads.MAX_FOLDERS + 2)]
-    assert len(list((tmp_path / "runs").iterdir())) == uploads.MAX_FOLDERS
-    assert [path.name for path in found.files(keys[-1])] == ["a.csv"]
+    keys = [found.store("", "a.csv", b"1") for _ in range(uploads.MAX_FOLDERS)]
+    with raises("upload.full"):
+        found.store("", "a.csv", b"1")
+    assert all([path.name for path in found.files(key)] == ["a.csv"] for key in keys)
+    old = time.time() - uploads.MAX_AGE - 60
+    for key in keys[:3]:
+        os.utime(tmp_path / "runs" / f".upload-{key}", (old, old))
+    found.files(keys[0])  # a use
+    found.forget(keys[-1])
+    keys = [keys[0], *keys[3:-1], found.store("", "b.csv", b"1")]
+    assert {path.name for path in (tmp_path / "runs").iterdir()} == {f".upload-{key}" for key in keys}
+
+
+def test_links_among_the_uploads_are_left_alone(tmp_path: Path) -> None:
+    found = Uploads(tmp_path / "runs")
+    found.store("", "a.csv", b"1")
+    (tmp_path / "outside").mkdir()
+    for number, target in (("b", tmp_path / "nowhere"), ("c", tmp_path / "outside")):
+        (tmp_path / "runs" / f".upload-{number * 16}").symlink_to(target)
+    assert found.store("", "a.csv", b"1")
+    assert (tmp_path / "outside").is_dir()
+
+
+def test_a_file_replaces_no_other_one_of_its_upload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = Uploads(tmp_path / "runs")
+    key = found.store("", "a.csv", b"first")
+    for name in ("a.csv", "A.csv"):
+        with raises("upload.twice"):
+            found.store(key, name, b"second")
+    assert [path.read_bytes() for path in found.files(key)] == [b"first"]
+    monkeypatch.setattr(uploads, "MAX_TOTAL", 8)
+    found.store(key, "b.csv", b"123")
+    with raises("upload.too_large"):
+        found.store(key, "c.csv", b"1")
+
+
+def test_cancel_removes_the_files(controlling: Any, tmp_path: Path) -> None:
+    key = send(controlling, "X.csv", positioning())[1]["key"]
+    for _ in range(2):
+        assert post(controlling, "/results/add/cancel", key=key, answers={})[0] == 200
+        assert not list((tmp_path / "runs").glob(".upload-*"))
+
+
+def test_old_uploads_are_removed_at_the_start(serving: Callable[..., Any], tmp_path: Path) -> None:
+    found = Uploads(tmp_path / "runs")
+    keys = [found.store("", "a.csv", b"1") for _ in range(2)]
+    old = time.time() - uploads.MAX_AGE - 60
+    os.utime(tmp_path / "runs" / f".upload-{keys[0]}", (old, old))
+    serving(tmp_path / "runs", control=True)
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == [f".upload-{keys[1]}"]
+
+
+@pytest.mark.parametrize("control", [False, True])
+def test_only_those_who_may_write_send_the_body_of_a_file(
+    serving: Callable[..., Any], tmp_path: Path, control: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serving(tmp_path / "runs", control=control)
+    stored: list[int] = []
+    inner = door._Request.data_received
+    monkeypatch.setattr(
+        door._Request, "data_received", lambda self, chunk: stored.append(self._answered) or inner(self, chunk)
+    )
+    headers = {"Origin": served.address.rstrip("/"), "Accept": "application/json", CONTROL_HEADER: "wrong"}
+    status = served.ask(f"{adding.UPLOAD}?name=a.csv", "POST", "1;2\n" * 10_000, **headers)[0]
+    assert status == 403
+    assert all(stored)
+
+
+def test_the_names_of_files_are_plain(tmp_path: Path) -> None:
+    found = Uploads(tmp_path / "runs")
+    keys = [found.store("", "a.csv", b"1")]
     for name in ("a\x00.csv", " a", "a\n", "..", "C:a"):
         with raises("upload.name"):
             found.store(keys[-1], name, b"1")

@@ -90,6 +90,16 @@ class Save(_Adding):
         await self.send({"run": run, "known": known})
 
 
+class Cancel(_Adding):
+    """Removal of an upload."""
+
+    async def post(self) -> None:
+        """Remove the files."""
+        key, _ = self.body()
+        await self.in_thread(self.uploads.forget, key)
+        await self.send({})
+
+
 def _added(paths: Sequence[Path], runs: Path, answers: dict[str, str]) -> tuple[str, bool]:
     """Return the key of the run of added files, and whether it was in the record already."""
     from errormotion.report import write_run_report
@@ -104,5 +114,6 @@ HANDLERS: tuple[tuple[str, type[Guarded]], ...] = (
     (UPLOAD, File),
     (r"/results/add/table\.json", Table),
     (r"/results/add/save", Save),
+    (r"/results/add/cancel", Cancel),
 )
 """Routes of this page."""

@@ -43,6 +43,7 @@ MAX_QUEUED = 64
 """Number of requests that wait for a thread of one kind."""
 MAX_MESSAGE = 2000
 """Longest message on a page, characters."""
+NO_CONTROL = "The dashboard was started without --allow-control"
 CODES = {
     400: "request.form",
     403: "request.forbidden",
@@ -151,7 +152,7 @@ class Guarded(RequestHandler):
             method, self.request.headers, session, public=self.public, controls=self.controls and self.context.control
         )
         if found is None and self.controls and not self.context.control:
-            found = 403, "The dashboard was started without --allow-control"
+            found = 403, NO_CONTROL
         if found is not None or not self.stops:
             await self._count("open" if found is not None or self.public else self.share)
         if found is None:

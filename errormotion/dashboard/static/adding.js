@@ -30,7 +30,7 @@ async function doing(work) {
 
 async function chosen(files) {
   await doing(async () => {
-    key = "";
+    await forget();
     for (const name of Object.keys(answers)) delete answers[name];
     for (const file of files) {
       const query = new URLSearchParams({ key, name: file.name, changed: file.lastModified });
@@ -38,6 +38,12 @@ async function chosen(files) {
     }
     await show();
   });
+}
+
+async function forget() {
+  const old = key;
+  key = "";
+  if (old) await post("/results/add/cancel", { key: old, answers: {} }).catch(() => {}); // gone, or removed later
 }
 
 async function show() {
@@ -165,5 +171,5 @@ byId("draft").addEventListener("submit", (event) => {
 byId("draft-cancel").addEventListener("click", () => {
   byId("draft").hidden = true;
   byId("files").value = "";
-  complain();
+  doing(forget);
 });
