@@ -158,6 +158,7 @@ def test_without_a_terminal_missing_answers_are_listed_with_their_options(run: R
         (("--machine", "Other"), "--machine Other: the data are of the machine 'VMC 850'"),
         (("--method", "circular_test"), "--method circular_test: the data are of the method 'linear_positioning'"),
         (("--map", "missing.toml"), "missing.toml"),
+        (("--set", "units.deviation=nm"), "--set units.deviation: a file with a schema states all of this"),
         (("--measured", "yesterday"), "--measured yesterday: expected a date"),
     ],
 )
@@ -168,6 +169,18 @@ def test_statements_that_contradict_the_data_are_refused(
     result = run("add", "a.csv", *options, code=2 if options[0] == "--measured" else 1)
     assert expected in result.stderr
     assert not list(tmp_path.glob("runs/*/run.json"))
+
+
+def test_answers_beside_a_map_and_another_start_are_refused(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(export(5))
+    (tmp_path / "map.toml").write_text(MAP)
+    message = run("add", "a.txt", "--map", "map.toml", "--set", "columns.deviation=EYX", *FAST, code=1).stderr
+    assert "--set columns.deviation: a map states all of this" in message
+    (tmp_path / "b.csv").write_text("# start = 2026-02-01T10:00:00+01:00\n" + readings(1))
+    message = run("add", "b.csv", "--measured", "2026-02-02T10:00+01:00", *FAST, code=1).stderr
+    assert "the data start at 2026-02-01T10:00:00+01:00" in message
+    assert not list(tmp_path.glob("runs/*/run.json"))
+    run("add", "b.csv", "--measured", "2026-02-01T09:00+00:00", *FAST)
 
 
 def test_three_repeats_have_a_history_in_the_order_of_their_measurement(run: Run, answer: Run, tmp_path: Path) -> None:

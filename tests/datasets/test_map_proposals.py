@@ -410,3 +410,33 @@ def test_columns_of_one_variable_in_other_units(tmp_path) -> None:
     write_map(accepted(propose([file]), {"columns.deviation": "EXX"}), tmp_path / "map.toml")
     values = import_files([file], tmp_path / "map.toml")["deviation"].isel(target=0).squeeze()
     np.testing.assert_allclose(values.sel(approach=["forward", "backward"]), [1e-6, 2e-9])
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "answer"),
+    [
+        (POSITIONING, "columns.target_position", "Typo"),
+        (POSITIONING, "columns.temperature", "Position"),
+        (POSITIONING, "columns.deviation", "Abweichung"),
+        (LONG, "columns.deviation", "EYX"),
+        (POSITIONING, "units.deviation", "nm"),
+        (POSITIONING, "units.target_position", "nonsense"),
+        (POSITIONING, "attributes.axis", "Q"),
+        (POSITIONING, "attributes.spindle", "1"),
+        (POSITIONING, "foo.axis", "X"),
+        (POSITIONING, "values.foo", "1 mm"),
+        (POSITIONING, "columns.foo", "Position"),
+    ],
+)
+def test_an_answer_without_effect_is_refused(tmp_path, text: str, key: str, answer: str) -> None:
+    file = file_of(tmp_path, text)
+    with pytest.raises(DatasetError, match=key) as first:
+        propose([file], answers={key: answer})
+    with pytest.raises(DatasetError, match=key) as later:
+        propose([file]).answered({key: answer})
+    assert first.value.code == later.value.code == "map.answer"
+
+
+def test_answers_that_only_other_schemas_have_are_ignored(tmp_path) -> None:
+    found = propose([file_of(tmp_path, POSITIONING)], answers={"values.bar_radius": "5 mm"})
+    assert "values" not in found.map

@@ -14,13 +14,14 @@ from errormotion.datasets.files.tomlfile import nearest
 from errormotion.datasets.maps.columns import Content, contents
 from errormotion.datasets.maps.content import map_of
 from errormotion.datasets.maps.fit import Fit, approached, fit, further
-from errormotion.datasets.maps.questions import APPROACH, Choice, Question, is_column, questions_of
+from errormotion.datasets.maps.questions import APPROACH, Choice, Question, is_column, place_of, questions_of
 from errormotion.datasets.maps.reading import kind_of
 from errormotion.datasets.schemas import RawSchema, raw_schemas
 from errormotion.datasets.tables.format import Format
 from errormotion.datasets.tables.reading import read_tables
 from errormotion.datasets.tables.table import Table
 from errormotion.errors import DatasetError
+from errormotion.kinematics.iso import DOF
 
 __all__ = ["Choice", "Preview", "Proposal", "Question", "propose"]
 
@@ -120,6 +121,7 @@ class _State:
     counts: tuple[int, ...] = ()
     form: Mapping[str, str] = field(default_factory=dict)
     chosen: RawSchema | None = None
+    checked: str = ""
 
 
 def propose(
@@ -134,21 +136,22 @@ def propose(
     schemas : sequence of RawSchema, optional
         Schemas that the dataset may have; default: those of all plugins.
     answers : mapping of str to str, optional
-        Answers that are known, by the keys of questions, such as ``values.bar_radius``. Those to questions of other
-        schemas are ignored.
+        Answers that are known, by the keys of questions, such as ``values.bar_radius``. Those that only other schemas
+        have are ignored.
 
     Raises
     ------
     DatasetError
-        A file cannot be read, or has no table of numbers; an answer is wrong.
+        A file cannot be read, or has no table of numbers; an answer is wrong, or has no schema.
     """
     if not paths:
         raise DatasetError("expected files; found none", code="map.files")
     state = _State(tuple(map(Path, paths)), tuple(schemas) or raw_schemas(), dict(answers))
-    return _proposal(state, set())
+    return _proposal(state, {key for key in answers if not any(_has(raw, key) for raw in state.schemas)})
 
 
 def _proposal(state: _State, new: set[str]) -> Proposal:
+    """Return the proposal with all answers; those in ``new`` are checked, and all when the schema is known."""
     form = {key.partition(".")[2]: text for key, text in state.answers.items() if key.startswith("format.") and text}
     if not state.columns or form != state.form:
         try:
@@ -174,14 +177,18 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
         )
         return Proposal(state.paths, "", "", (), tuple(previews), {}, (), (note,), state)
     chosen, main = next(((each, k) for each, k in fits if each.raw.title == wanted), fits[0])
+    if (wanted or len(fits) == 1) and chosen.raw.title != state.checked:  # for this schema nothing was checked so far
+        new = new | {key for key in state.answers if _has(chosen.raw, key)}
+        state = replace(state, checked=chosen.raw.title)
     state = replace(state, chosen=chosen.raw)
     parts = _parts(state, chosen, main)
     questions = questions_of(parts, state.answers, new, _above(state))
+    _refuse_unused(new, questions, parts, state.answers)
+    questions = [each for each in questions if each.key not in state.answers]
     if len(fits) > 1 and not wanted:
         clear = fits[0][0].score - fits[1][0].score >= _MARGIN
         proposed = candidates[0].value if clear else ""
         questions = [Question("raw", "Which kind of measurement is this?", candidates, proposed, True), *questions]
-    _refuse_unknown(new, questions, parts)
     tables = [parts[0].columns[0].column.table, *(each.columns[0].column.table for each in parts[1:])]
     kind = "" if chosen.ways else kind_of(tables)  # a direction that the file does not state is asked for each one
     content = map_of(parts, state.answers, questions, kind, form)
@@ -268,7 +275,8 @@ def _corrected(found: Fit, columns: Sequence[Content], answers: Mapping[str, str
             continue
         column = next((each for each in columns if is_column(text, each)), None)
         if column is None:
-            continue
+            titles = {place_of(each) for each in columns}
+            raise DatasetError(f"{key}: expected a column of the file; {nearest(text, titles)}", code="map.answer")
         other = next((each for each in found.columns if each.column.index == column.index), None)
         if other is not None:
             other.column = own.column
@@ -282,20 +290,53 @@ def _above(state: _State) -> list[str]:
     return [*lines, *(re.sub(r"[_\W]+", " ", path.stem) for path in state.paths)]
 
 
-def _refuse_unknown(new: Iterable[str], questions: Sequence[Question], parts: Sequence[Fit]) -> None:
-    """Raise DatasetError for an answer to a key that neither a question nor the schema has."""
+def _has(raw: RawSchema, key: str) -> bool:
+    """Return whether a schema can have a question with this key."""
+    head, _, name = key.partition(".")
+    if head in ("columns", "units", "values"):
+        return name.partition(".")[0] in {row.name for row in (*raw.rows, *raw.stated)}
+    if head == "attributes":
+        return name in raw.attributes
+    return key in ("raw", "machine") or (head == "format" and bool(name))
+
+
+def _refuse_unused(
+    new: Iterable[str], questions: Sequence[Question], parts: Sequence[Fit], answers: Mapping[str, str]
+) -> None:
+    """Raise DatasetError for an answer that has no effect: to no question, or to what the file itself states."""
     raw = parts[0].raw
-    rows = {row.name for row in (*raw.rows, *raw.stated)}
+    keys = [each.key for each in questions]
     for key in new:
         head, _, name = key.partition(".")
-        known = key in ("raw", "machine", *((APPROACH,) if parts[0].ways else ())) or key in {
-            each.key for each in questions
-        }
-        known |= head in ("columns", "units", "values") and name.partition(".")[0] in rows
-        known |= head in ("attributes", "format") and bool(name)
-        if not known:
-            keys = [each.key for each in questions] + [f"values.{each}" for each in rows]
-            raise DatasetError(f"{key}: no such question; {nearest(key, keys)}", code="map.answer")
+        reason = ""
+        if not (_has(raw, key) or key in keys or (key == APPROACH and parts[0].ways)):
+            known = [*keys, *(f"values.{row.name}" for row in (*raw.rows, *raw.stated))]
+            reason = f"no such question; {nearest(key, known)}"
+        elif head == "columns" and (key not in keys or f"{name}.?" in {each.key for each in parts[0].columns}):
+            reason = _of_columns(name, answers[key], parts)
+        elif head == "units" and answers[key] and key not in keys and not _is_difference(name, parts):
+            reason = "has no effect, since the file states the unit, or has no such column"
+        if reason:
+            raise DatasetError(f"{key}: {reason}", code="map.answer")
+
+
+def _of_columns(name: str, text: str, parts: Sequence[Fit]) -> str:
+    """Return why an answer to which column has a variable, or which error is in it, has no effect; empty if it has."""
+    if any(each.key == name for each in parts[0].columns):
+        return ""  # a column, see _corrected
+    if not any(each.key == f"{name}.?" for part in parts for each in part.columns):
+        recognised = [each.key.removesuffix(".?") for each in parts[0].columns if not each.labels]
+        return f"expected one of the columns {', '.join(dict.fromkeys(recognised))}; describe others in a map"
+    if text and text[:2] not in DOF:
+        return f"expected an error, such as EXX; found '{text}'"
+    return ""
+
+
+def _is_difference(name: str, parts: Sequence[Fit]) -> bool:
+    """Return whether a variable is the difference of two columns, of which none states a unit."""
+    own = [each for part in parts for each in part.columns if each.name == name]
+    rows = {row.name: row for row in parts[0].raw.rows}
+    return any(each.minus is not None and not each.column.unit_for(rows[name]) for each in own)
 
 
 def _preview(columns: Sequence[Content], count: int, meanings: Sequence[str]) -> Preview:

@@ -80,7 +80,7 @@ class Question:
 def questions_of(
     parts: Sequence[Fit], answers: Mapping[str, str], new: set[str], above: Sequence[str]
 ) -> list[Question]:
-    """Return the questions that the columns of all parts leave open, without those that are answered.
+    """Return the questions that the columns of all parts leave open, with those that are answered.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def questions_of(
     for key in new - {each.key for each in found}:
         if key.startswith("values.") and key.partition(".")[2] in rows:
             _check(Question(key, "", (), "", False), answers[key], main)
-    return [each for each in found if each.key not in answers]
+    return found
 
 
 def _columns(main: Fit) -> list[Question]:

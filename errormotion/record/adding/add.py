@@ -24,6 +24,7 @@ from errormotion.campaign.folder import RunFolder, first_entries, now
 from errormotion.campaign.runner import identify_run, report_run, settings_hash
 from errormotion.campaign.storage.journal import cause_of, journal
 from errormotion.datasets import provenance
+from errormotion.datasets.files.events import instant
 from errormotion.datasets.files.reading import parse_json
 from errormotion.datasets.files.tomlfile import read_toml
 from errormotion.datasets.maps.questions import Question
@@ -177,8 +178,14 @@ class _Adding:
                     code="add.axis.contradiction",
                 )
             found["axis"] = request.axis
-        if request.measured and "start" not in raw.attrs:
-            found["start"] = request.measured
+        if request.measured:
+            start = str(raw.attrs.get("start", request.measured))
+            if not _is_same_time(start, request.measured):
+                raise DatasetError(
+                    f"--measured {request.measured}: the data start at {start}; omit the option",
+                    code="add.measured.contradiction",
+                )
+            found["start"] = start
         if self.statement.operator:
             found["operator"] = self.statement.operator
         if self.statement.instruments and "instruments" not in raw.attrs:
@@ -254,6 +261,14 @@ def _start(raw: xr.Dataset, files: Sequence[Path]) -> tuple[str, str]:
         return stated, ""
     changed = min(path.stat().st_mtime for path in files)
     return datetime.fromtimestamp(changed, UTC).isoformat(timespec="seconds"), "last change of the file"
+
+
+def _is_same_time(one: str, other: str) -> bool:
+    """Return whether two times are the same within a second."""
+    first, second = instant(one), instant(other)
+    if first is None or second is None:
+        return one == other
+    return abs((first - second).total_seconds()) < 1
 
 
 @contextmanager

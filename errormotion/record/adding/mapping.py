@@ -58,9 +58,13 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
     Raises
     ------
     DatasetError
-        The files have no table that fits a raw schema, or an answer is missing or wrong.
+        The files have no table that fits a raw schema, or an answer is missing or wrong, or would have no effect.
     """
     map_file = folder / MAP
+    if request.answers and (request.map is not None or all(is_raw(copy) for copy in copies)):
+        keys = ", ".join(f"--set {key}" for key in request.answers)
+        reason = "a map states all of this" if request.map is not None else "a file with a schema states all of this"
+        raise DatasetError(f"{keys}: {reason}; omit the option, or correct the file", code="add.answers.unused")
     if request.map is not None:
         replace_bytes(map_file, request.map.read_bytes())
         return MapOfFiles(map_file)
@@ -76,6 +80,8 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
         write_own_map(model, known, map_file)
         return MapOfFiles(map_file)
     schemas: Sequence[RawSchema] = plugins.get("methods", request.method).raw_schemas if request.method else ()
+    if schemas and not any("axis" in each.attributes for each in schemas):
+        known.pop("attributes.axis", None)  # an attribute without a meaning for the method
     found = propose(copies, tuple(schemas), answers=known)
     if not found.questions and not found.schema:
         raise DatasetError(f"{found.notes[0]}; describe them by a map: --map FILE", code="add.file.unknown")

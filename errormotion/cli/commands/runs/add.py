@@ -19,7 +19,7 @@ from errormotion.record.adding.add import add as add_files
 from errormotion.record.adding.questions import Ask, refuse, take_proposals
 from errormotion.record.adding.request import Request
 
-_OF_MAP = ("columns.", "units.", "values.", "attributes.", "format.", "map.", "raw=")
+_OF_MAP = ("columns.", "units.", "values.", "attributes.", "format.", "labels.", "map.", "raw=")
 """Start of the assignments that answer questions on the files; others are settings of the method."""
 
 
