@@ -193,3 +193,36 @@ def test_the_names_of_files_are_plain(tmp_path: Path) -> None:
     with raises("upload.gone"):
         found.store("a" * 16, "b.csv", b"1")
     assert list((tmp_path / "outside").iterdir()) == []
+
+
+def test_only_columns_that_can_be_corrected_have_a_key(controlling: Any) -> None:
+    """Each column of a matrix is one run of one variable; a correction of it would be ignored."""
+    matrix = "Position [mm];R1 [µm];R2 [µm];R3 [µm]\n" + "".join(f"{t};{t}.1;{t}.2;{t}.3\n" for t in range(10, 100, 9))
+    key = send(controlling, "X.csv", matrix)[1]["key"]
+    [table] = post(controlling, "/results/add/table.json", key=key, answers={})[1]["tables"]
+    assert table["meanings"][1].startswith("deviation.?, run")
+    assert table["keys"] == ["columns.target_position", "", "", ""]
+
+
+def test_each_key_of_a_column_changes_its_meaning(controlling: Any) -> None:
+    log = "Time [s];front [°C];back [°C];spare [°C]\n" + "".join(f"{60 * k};{20 + k};{k};{2 * k}\n" for k in range(20))
+    key = send(controlling, "a.csv", log)[1]["key"]
+    [table] = post(controlling, "/results/add/table.json", key=key, answers={})[1]["tables"]
+    changed = 0
+    for own, title in zip(table["keys"], table["titles"], strict=True):
+        other = next(each for each in table["titles"] if each != title)
+        if own:
+            [again] = post(controlling, "/results/add/table.json", key=key, answers={own: other})[1]["tables"]
+            assert again["meanings"] != table["meanings"], own
+            changed += 1
+    assert changed >= 3
+
+
+def test_a_second_table_has_no_keys(controlling: Any) -> None:
+    """Its time has the name of that of the first table, which would be changed."""
+    key = send(controlling, "X.csv", positioning())[1]["key"]
+    log = "Time [s];bar [°C]\n" + "".join(f"{60 * k};{20 + 0.1 * k:.1f}\n" for k in range(20))
+    send(controlling, "b.csv", log, key)
+    first, second = post(controlling, "/results/add/table.json", key=key, answers={})[1]["tables"]
+    assert first["keys"] == ["columns.target_position", ""]
+    assert second["keys"] == ["", ""]

@@ -79,18 +79,18 @@ function tableOf(each, number) {
   frame.setAttribute("role", "region");
   frame.setAttribute("aria-label", title);
   const names = each.titles.filter((name, k) => name && each.titles.indexOf(name) === k);
-  const correctable = each.meanings.map((meaning, k) => [meaning, each.titles[k]])
-    .filter(([meaning, name], k) => meaning && !/^labels\.|\?$/.test(meaning) && each.meanings.indexOf(meaning) === k && names.includes(name));
+  const correctable = each.keys.map((own, k) => [own, each.meanings[k], each.titles[k]])
+    .filter(([own, , name]) => own && names.includes(name));
   if (!correctable.length) return [frame];
   const more = element("details");
   more.append(element("summary", "Correct the columns"));
-  correctable.forEach(([meaning, name], k) => {
+  correctable.forEach(([own, meaning, name], k) => {
     const choices = names.map((value) => ({ value, text: value }));
     const field = fieldOf(`column-${number}-${k}`, meaning, choices, name, true);
-    field.querySelector("select").addEventListener("change", (event) => changed(`columns.${meaning}`, event.target.value));
+    field.querySelector("select").addEventListener("change", (event) => changed(own, event.target.value));
     more.append(field);
   });
-  more.open = correctable.some(([meaning]) => `columns.${meaning}` in answers);
+  more.open = correctable.some(([own]) => own in answers);
   return [frame, more];
 }
 

@@ -111,6 +111,15 @@ class Fit:
                 found[each.minus.index] = f"subtracted from {each.key}"
         return found
 
+    def keys(self, count: int) -> list[str]:
+        """Return the key of each column of the table for which another one can be stated; empty for the others."""
+        found = [""] * count
+        keys = [each.key for each in self.columns]
+        for each in self.columns:
+            if keys.count(each.key) == 1 and not each.labels and not each.key.endswith("?"):
+                found[each.column.index] = f"columns.{each.key}"
+        return found
+
 
 @dataclass(frozen=True)
 class _Schema:

@@ -41,6 +41,8 @@ class Preview:
         Sheet of a spreadsheet; empty for other files.
     titles, units, meanings : tuple of str
         Of each column; empty for no unit in the file, and for a column that is not used.
+    keys : tuple of str
+        Of each column, the key of the answer that states another column instead; empty where none can be stated.
     rows : tuple of tuple of str
         The first rows.
     count : int
@@ -55,6 +57,7 @@ class Preview:
     titles: tuple[str, ...]
     units: tuple[str, ...]
     meanings: tuple[str, ...]
+    keys: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     count: int
     format: Mapping[str, str]
@@ -197,7 +200,9 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
     notes = []
     for columns, count in zip(state.columns, state.counts, strict=True):
         part = by_table.get(id(columns[0].table))
-        previews.append(_preview(columns, count, part.meanings(len(columns[0].table.titles)) if part else []))
+        width = len(columns[0].table.titles)
+        keys = parts[0].keys(width) if part is parts[0] else []  # answers are for the table of the readings
+        previews.append(_preview(columns, count, part.meanings(width) if part else [], keys))
         if part is None:
             table = columns[0].table
             where = f"sheet '{table.form.sheet}' of " if table.form.sheet else ""
@@ -339,7 +344,7 @@ def _is_difference(name: str, parts: Sequence[Fit]) -> bool:
     return any(each.minus is not None and not each.column.unit_for(rows[name]) for each in own)
 
 
-def _preview(columns: Sequence[Content], count: int, meanings: Sequence[str]) -> Preview:
+def _preview(columns: Sequence[Content], count: int, meanings: Sequence[str], keys: Sequence[str] = ()) -> Preview:
     table = columns[0].table
     width = len(table.titles)
     cells = [list(table.cells.texts(k)[:_ROWS]) for k in range(width)]
@@ -356,6 +361,7 @@ def _preview(columns: Sequence[Content], count: int, meanings: Sequence[str]) ->
         tuple(table.titles),
         units,
         tuple(meanings) or ("",) * width,
+        tuple(keys) or ("",) * width,
         rows,
         count,
         form,
