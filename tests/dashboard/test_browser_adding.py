@@ -1,5 +1,6 @@
 """Files in Chromium: chosen or dropped on the page Results, corrected, and saved as a run."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,30 @@ def test_a_dropped_file_is_corrected_and_saved(
     [folder] = [RunFolder.open(each.parent) for each in (tmp_path / "runs").glob("*/run.json")]
     assert folder.finished
     assert folder.data["imported"]["files"][0]["name"] == "X axis.csv"
+
+
+def test_a_file_of_the_record_is_shown_as_such_and_added_once_more(
+    page: Any, accessible: Callable[[], None], serving: Callable[..., Any], tmp_path: Path
+) -> None:
+    served = serving(tmp_path / "runs", control=True)
+    for count in (1, 2):
+        served.enter(page, "results")
+        page.evaluate(DROP, ["X axis.csv", positioning()])
+        page.wait_for_selector("#draft table")
+        page.get_by_label("On which machine was this measured?").fill("Mill 7")
+        page.get_by_label("Which axis was measured?").select_option("X")
+        known = page.locator("#draft-known")
+        sync_api.expect(known).to_be_visible() if count == 2 else sync_api.expect(known).to_be_hidden()
+        accessible()
+        page.get_by_role("button", name="Add once more" if count == 2 else "Add as a run").click()
+        page.wait_for_url("**/run?run=*", timeout=60_000)
+        assert len(list((tmp_path / "runs").glob("*/run.json"))) == count
+    served.enter(page, "results")
+    page.evaluate(DROP, ["X axis.csv", positioning()])
+    sync_api.expect(page.locator("#draft-known a")).to_have_attribute("href", re.compile(r"/run\?run=.+"))
+    page.get_by_role("button", name="Cancel").click()
+    sync_api.expect(page.locator("#adding")).to_have_attribute("aria-busy", "false")
+    assert not list((tmp_path / "runs").glob(".upload-*"))
 
 
 def test_a_chosen_log_is_shown_without_its_markup_and_a_wrong_file_with_its_reason(

@@ -226,3 +226,18 @@ def test_a_second_table_has_no_keys(controlling: Any) -> None:
     first, second = post(controlling, "/results/add/table.json", key=key, answers={})[1]["tables"]
     assert first["keys"] == ["columns.target_position", ""]
     assert second["keys"] == ["", ""]
+
+
+def test_files_of_the_record_are_added_once_more_on_request_only(controlling: Any, tmp_path: Path) -> None:
+    answers = {"machine": "Mill", "attributes.axis": "X", "columns.deviation": "EXX"}
+    runs, found = tmp_path / "runs", []
+    for again in (False, False, True):
+        key = send(controlling, "X.csv", positioning())[1]["key"]
+        draft = post(controlling, "/results/add/table.json", key=key, answers={})[1]
+        assert draft["known"] == ("" if not found else found[0])
+        status, added = post(controlling, "/results/add/save", key=key, answers=answers, again=again)
+        assert (status, added["known"]) == (200, bool(found) and not again)
+        assert (runs / f".upload-{key}").exists() == added["known"]  # what was corrected can be added
+        found.append(added["run"])
+    assert found[1] == found[0] != found[2]
+    assert {path.parent.name for path in runs.glob("*/run.json")} == {*found}

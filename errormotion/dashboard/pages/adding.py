@@ -82,11 +82,13 @@ class Save(_Adding):
     """Addition of an upload as a run."""
 
     async def post(self) -> None:
-        """Add the files, and send the key of the run."""
+        """Add the files, and send the key of the run; files that are in the record only if this is requested."""
         key, answers = self.body()
+        again = parse_json(self.request.body).get("again") is True
         paths = self.uploads.files(key)
-        run, known = await self.in_slow_thread(_added, paths, self.context.lab.runs, answers)
-        self.uploads.forget(key)
+        run, known = await self.in_slow_thread(_added, paths, self.context.lab.runs, answers, again)
+        if not known:
+            self.uploads.forget(key)
         await self.send({"run": run, "known": known})
 
 
@@ -100,12 +102,12 @@ class Cancel(_Adding):
         await self.send({})
 
 
-def _added(paths: Sequence[Path], runs: Path, answers: dict[str, str]) -> tuple[str, bool]:
+def _added(paths: Sequence[Path], runs: Path, answers: dict[str, str], again: bool) -> tuple[str, bool]:
     """Return the key of the run of added files, and whether it was in the record already."""
     from errormotion.report import write_run_report
 
     of_files: dict[str, Any] = {key: text for key, text in answers.items() if key != "machine"}
-    request = Request(tuple(paths), runs, machine=answers.get("machine", ""), answers=of_files)
+    request = Request(tuple(paths), runs, machine=answers.get("machine", ""), answers=of_files, again=again)
     found = add(request, take_proposals, report=write_run_report)
     return found.folder.path.name, found.known
 

@@ -2,7 +2,7 @@
 "use strict";
 
 const answers = {};
-let key = "", asked = 0;
+let key = "", known = "", asked = 0;
 
 const post = (path, body) => answerOf(path, { body, limit: 0, stay: true });
 
@@ -52,6 +52,12 @@ async function show() {
   if (own !== asked) return;
   byId("draft").hidden = false;
   byId("draft-kind").textContent = found.kind;
+  ({ known } = found);
+  const run = element("a", known);
+  run.href = `/run?${new URLSearchParams({ run: known })}`;
+  byId("draft-known").replaceChildren("These files are in the record already, as the run ", run, ". Nothing is changed there; with what is stated here they can be added once more, as another run.");
+  byId("draft-known").hidden = !known;
+  byId("draft-save").textContent = known ? "Add once more" : "Add as a run";
   byId("draft-tables").replaceChildren(...found.tables.flatMap(tableOf));
   byId("draft-questions").replaceChildren(...found.questions.map(questionOf));
   byId("draft-notes").replaceChildren(...found.notes.map((each) => element("li", each)));
@@ -164,7 +170,11 @@ drop.addEventListener("drop", (event) => {
 byId("draft").addEventListener("submit", (event) => {
   event.preventDefault();
   doing(async () => {
-    const found = await post("/results/add/save", { key, answers: { ...typed(), ...answers } });
+    const found = await post("/results/add/save", { key, answers: { ...typed(), ...answers }, again: Boolean(known) });
+    if (found.known) { // added meanwhile
+      await show();
+      throw new Error("These files are in the record already, and were not added once more.");
+    }
     location.assign(`/run?${new URLSearchParams({ run: found.run })}`);
   });
 });

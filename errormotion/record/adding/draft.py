@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from errormotion.datasets.maps.proposal import Preview, Question, propose
 from errormotion.errors import DatasetError
 from errormotion.record.adding.machines import load_machines
 from errormotion.record.adding.mapping import of_machine
+from errormotion.record.adding.originals import originals_of, run_of
 from errormotion.record.adding.own_maps import own_map, questions_of
 from errormotion.record.adding.reading import is_raw, owner_of, read_raw
 from errormotion.record.adding.request import Request
@@ -30,12 +31,15 @@ class Draft:
     questions : tuple of Question
         All that the answers leave open; ``proposed`` is also what is known of the machine.
     notes : tuple of str
+    known : str
+        Key of the finished run of these files in the record; empty if there is none.
     """
 
     kind: str
     tables: tuple[Preview, ...]
     questions: tuple[Question, ...]
     notes: tuple[str, ...]
+    known: str = ""
 
     def plain(self) -> dict[str, Any]:
         """Return the draft for a JSON document."""
@@ -45,6 +49,7 @@ class Draft:
             "tables": tables,
             "questions": [asdict(each) for each in self.questions],
             "notes": list(self.notes),
+            "known": self.known,
         }
 
 
@@ -56,7 +61,13 @@ def draft_of(paths: Sequence[Path], runs: Path, answers: Mapping[str, str]) -> D
     DatasetError
         A file cannot be read, or an answer is wrong (``map.answer``).
     """
-    machines = Request(tuple(paths), runs).record.machines
+    record = Request(tuple(paths), runs).record
+    before = run_of(originals_of(paths).values(), record)
+    known = before.path.name if before is not None and before.finished else ""
+    return replace(_draft(paths, runs, record.machines, answers), known=known)
+
+
+def _draft(paths: Sequence[Path], runs: Path, machines: Sequence[str], answers: Mapping[str, str]) -> Draft:
     if all(is_raw(path) for path in paths):
         with read_raw(paths, None) as raw:
             owner, machine = owner_of(raw), str(raw.attrs.get("machine", "")).replace("unknown", "")
