@@ -118,6 +118,30 @@ def test_the_same_file_is_recognised_by_its_content(run: Run, answer: Run, tmp_p
     assert len(list((tmp_path / "runs").glob("*/run.json"))) == 2
 
 
+def test_a_known_file_with_other_statements_is_refused_with_the_differences(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(readings(1))
+    (tmp_path / "head.toml").write_text(HEAD)
+    stated = ("--machine", "VMC 850", "--axis", "X", *FAST, "--head", "head.toml", "--set", "dwell=5 s")
+    run("add", "a.csv", *stated)
+    for same in (stated, (), FAST):
+        assert "in the record already" in run("add", "a.csv", *same).stdout
+    for other, expected in (
+        (("--machine", "Other"), "--machine Other (there VMC 850)"),
+        (("--axis", "Y"), "--axis Y (there X)"),
+        (("--method", "circular_test"), "--method circular_test (there linear_positioning)"),
+        (("--set", "dwell=6 s"), "--set dwell=..."),
+        (("--set", "units.deviation=nm"), "--set units.deviation=nm"),
+        (("--test", "acceptance"), "--test acceptance"),
+        (("--measured", "2026-02-01T10:00+01:00"), "--measured 2026-02-01T10:00:00+01:00"),
+    ):
+        message = run("add", "a.csv", *other, code=1).stderr
+        assert expected in message
+        assert "--again" in message
+    (tmp_path / "head.toml").write_text(HEAD.replace("R-17", "R-18"))
+    assert "--head head.toml" in run("add", "a.csv", "--head", "head.toml", code=1).stderr
+    assert len(list((tmp_path / "runs").glob("*/run.json"))) == 1
+
+
 def test_a_map_is_kept_and_a_failed_run_is_continued_by_the_same_command(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(export(1))
     (tmp_path / "map.toml").write_text(MAP)
@@ -130,6 +154,9 @@ def test_a_map_is_kept_and_a_failed_run_is_continued_by_the_same_command(run: Ru
     stated = ("--set", "uncertainty.scatter=0.3 um", "--set", "uncertainty.drift=0.3 um")
     run("add", "a.txt", *FAST, *stated)
     assert single(tmp_path / "runs").finished  # the kept map is used, and there is one run
+    run("add", "a.txt", "--map", "map.toml", *FAST, *stated)
+    (tmp_path / "map.toml").write_text(MAP.replace("0.4e-6", "0.5e-6"))
+    assert "--map map.toml" in run("add", "a.txt", "--map", "map.toml", code=1).stderr
 
 
 def test_nothing_is_left_of_files_that_cannot_be_read(run: Run, tmp_path: Path) -> None:

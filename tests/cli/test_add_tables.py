@@ -172,6 +172,15 @@ def test_a_script_does_not_take_the_axis_of_an_earlier_file(run: Run, tmp_path: 
     assert [each.data["test"][-1] for each in found()] == ["X", "Y"]
 
 
+def test_answers_to_a_known_file_are_compared_with_those_before(run: Run, tmp_path: Path) -> None:
+    stated = ("--yes", *FAST, "--axis", "X", "--machine", "M")
+    file = positioning(tmp_path / "a.xlsx", title="Messung")
+    run("add", file, *stated, "--set", "values.length_uncertainty=1e-6")
+    run("add", file, *stated, "--set", "values.length_uncertainty=1e-6", "--set", "columns.deviation=EXX")
+    for other in ("values.length_uncertainty=2e-6", "columns.deviation=EYX", "values.functional_point=0 0 1 mm"):
+        assert f"--set {other}" in run("add", file, *stated, "--set", other, code=1).stderr
+
+
 def test_a_script_does_not_take_the_machine_of_an_earlier_file_where_the_record_has_several(
     run: Run, tmp_path: Path
 ) -> None:

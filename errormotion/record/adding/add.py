@@ -30,6 +30,7 @@ from errormotion.datasets.files.tomlfile import read_toml
 from errormotion.datasets.maps.questions import Question
 from errormotion.errors import DatasetError, RunError, code_of
 from errormotion.plugins import Method
+from errormotion.record.adding.differences import differences
 from errormotion.record.adding.machines import remember
 from errormotion.record.adding.mapping import MapOfFiles, map_of_files, of_machine
 from errormotion.record.adding.originals import KEPT, MAP, Original, keep, originals_of, run_of
@@ -77,12 +78,13 @@ def add(
     Returns
     -------
     Added
-        The run; that of an earlier call if the files are in the record.
+        The run; that of an earlier call if the files are in the record, and nothing else is stated about them.
 
     Raises
     ------
     DatasetError
-        A file cannot be read, an answer is missing, or statements contradict the data: nothing was added.
+        A file cannot be read, an answer is missing, or statements contradict the data, or a run of the same files:
+        nothing was added.
     RunError
         The identification failed: the run folder with the files and the raw data is kept, and the message states how
         to continue.
@@ -90,6 +92,13 @@ def add(
     originals = originals_of(request.files)
     before = None if request.again else run_of(originals.values(), request.record)
     if before is not None and before.finished:
+        if stated := differences(request, before):
+            names = ", ".join(path.name for path in request.files)
+            raise DatasetError(
+                f"{names}: in the record already, {before.path}; not applied to this run: {', '.join(stated)}. Omit "
+                "these options, or add once more by --again",
+                code="add.known.differs",
+            )
         return Added(before, known=True)
     work = _Adding(request, originals, ask, stage)
     if before is None:
@@ -202,6 +211,7 @@ class _Adding:
             KEPT: {
                 "files": [each.plain() for each in self.originals.values()],
                 "map": self.map.file.name if self.map.file is not None else None,
+                "answers": self.map.given,
             },
             "created": start,
             "created_from": source,

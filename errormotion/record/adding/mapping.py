@@ -44,11 +44,14 @@ class MapOfFiles:
         The map in the run folder; None for files that need none.
     answers : dict of str to str
         What was answered otherwise than proposed.
+    given : dict of str to str
+        All answers, also the proposed ones.
     notes : tuple of str
     """
 
     file: Path | None = None
     answers: dict[str, str] = field(default_factory=dict)
+    given: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
@@ -78,7 +81,7 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
         while questions := questions_of(model, known):
             known |= ask(questions)
         write_own_map(model, known, map_file)
-        return MapOfFiles(map_file)
+        return MapOfFiles(map_file, given=known)
     schemas: Sequence[RawSchema] = plugins.get("methods", request.method).raw_schemas if request.method else ()
     if schemas and not any("axis" in each.attributes for each in schemas):
         known.pop("attributes.axis", None)  # an attribute without a meaning for the method
@@ -93,9 +96,10 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
         found = found.answered(contradiction)
     if request.answers:
         found = found.answered(request.answers)  # refuses those to questions that there are not
-    answered, notes, found = _asked(found, request, ask)
+    given, answered, notes, found = _asked(found, request, ask)
     write_map(found, map_file, overwrite=True)
-    return MapOfFiles(map_file, answers=answered | dict(request.answers), notes=notes)
+    stated = dict(request.answers)
+    return MapOfFiles(map_file, answered | stated, known | given | stated, notes)
 
 
 def of_machine(question: Question, machines: Sequence[str]) -> Question:
@@ -106,8 +110,14 @@ def of_machine(question: Question, machines: Sequence[str]) -> Question:
     return Question("machine", "On which machine was this measured?", choices, proposed, True, question.earlier)
 
 
-def _asked(found: Proposal, request: Request, ask: Ask) -> tuple[dict[str, str], tuple[str, ...], Proposal]:
-    """Return answers, notes and the proposal without questions; what is known of the machine is not asked."""
+def _asked(
+    found: Proposal, request: Request, ask: Ask
+) -> tuple[dict[str, str], dict[str, str], tuple[str, ...], Proposal]:
+    """Return all answers, those of people, notes and the proposal without questions.
+
+    What is known of the machine is not asked.
+    """
+    given: dict[str, str] = {}
     answered: dict[str, str] = {}
     before, mistake = set[str](), ""
     while found.questions:
@@ -129,8 +139,9 @@ def _asked(found: Proposal, request: Request, ask: Ask) -> tuple[dict[str, str],
                 raise DatasetError(f"{request.runs / FILE}: {error}", code="map.answer") from error
             mistake = str(error)
             continue
+        given |= new
         answered |= {key: text for key, text in new.items() if key in questions and text != questions[key].proposed}
-    return answered, (*found.notes, *(f"as before on this machine: {key}" for key in sorted(before))), found
+    return given, answered, (*found.notes, *(f"as before on this machine: {key}" for key in sorted(before))), found
 
 
 def _contradiction(
