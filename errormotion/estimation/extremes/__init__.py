@@ -36,6 +36,8 @@ POINTED = 1.0
 _VALUES = 1_000_000
 """Largest number of simulated values; fewer draws are made for longer curves."""
 _FEWEST = 100
+_OUTER, _INNER = 15, 10
+"""Pairs of draws from which the scatter of a corrected figure follows."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +77,13 @@ def of_noisy_values(
     seed: int = SEED,
     bias_uncertainty: float = BIAS_UNCERTAINTY,
     skewed: bool = False,
+    corrected: bool = False,
 ) -> Extremes:
     """Return figures of measured values with their bias and uncertainty, by noise that is added once more.
 
-    State ``value - bias`` with u, or value with `expanded`.
+    State ``value - bias`` with u, or value with `expanded`. The bias is itself a function of the noisy values: with the
+    mean G of figures F with further noise, ``C = F - FLAT (G - F)``. Where few places compete for an extreme, C
+    scatters more than F. The ratio of both is that over values with further noise.
 
     Parameters
     ----------
@@ -98,6 +103,8 @@ def of_noisy_values(
         Standard uncertainty of a bias, relative to it.
     skewed : bool
         Whether u is increased to half of the 95 % deviation on the longer side, where that is larger.
+    corrected : bool
+        Whether u is that of ``value - bias`` (C), and not of the value (F).
     """
     if draws is None:
         draws = int(np.clip(_VALUES // max(values.size, 1), _FEWEST, DRAWS))
@@ -105,15 +112,34 @@ def of_noisy_values(
     half = independent * draw((draws // 2, *values.shape))
     half += np.tensordot(draw((draws // 2, len(shared))), shared, axes=1)
     first = figures(values)
-    again = figures(values + np.concatenate([half, -half]))  # in pairs, so that the draws cause no bias
+    noise = np.concatenate([half, -half])  # in pairs, so that the draws cause no bias
+    again = figures(values + noise)
     mean, deviation = again.mean(axis=0), again.std(axis=0, ddof=1)
     bias = FLAT * (mean - first)
+    more = _scatter_of_corrected(figures, values, half, again) if corrected else np.ones_like(deviation)
+    deviation = deviation * more
     extra = np.square(bias_uncertainty * bias)
     if skewed:
-        tail = np.abs(np.quantile(again, (0.025, 0.975), axis=0) - mean).max(axis=0) / 2.0
+        tail = more * np.abs(np.quantile(again, (0.025, 0.975), axis=0) - mean).max(axis=0) / 2.0
         extra = extra + np.maximum(tail**2 - deviation**2, 0.0)
-    covariance = np.cov(again.T) + (np.diag(extra) if extra.ndim else extra)
+    covariance = np.multiply.outer(more, more) * np.cov(again.T) + (np.diag(extra) if extra.ndim else extra)
     return Extremes(first, bias, np.hypot(deviation, np.sqrt(extra)), covariance)
+
+
+def _scatter_of_corrected(figures: Callable[[Array], Array], values: Array, half: Array, again: Array) -> Array:
+    """Return the ratio of the standard deviations of C and F, at least 1; see `of_noisy_values`.
+
+    The same inner draws for all outer ones: their number then makes no scatter of C.
+    """
+    outer, inner = half[:_OUTER], half[_OUTER : _OUTER + _INNER]
+    beside = np.concatenate([inner, -inner])
+    F, C = [], []
+    for k, noise in enumerate(outer):
+        for its, plus in ((again[k], noise), (again[len(half) + k], -noise)):
+            F.append(its)
+            C.append(its - FLAT * (figures(values + plus + beside).mean(axis=0) - its))
+    of_F, of_C = (np.var(each, axis=0, ddof=1) for each in (F, C))
+    return np.asarray(np.sqrt(np.maximum(of_C / np.where(of_F > 0, of_F, np.inf), 1.0)))
 
 
 def range_from_reference(values: Array, variance: Array, shared: Array) -> Extremes:

@@ -114,10 +114,12 @@ def _of_sectors(
     described = bool(np.nanmax(np.abs(step)) <= norm.isf(FALSE_ALARM / (2 * step.size)))
     shared = np.array([source.effect for source in sources]).reshape(-1, 2, places)
     its = of_path(value, np.where(np.isfinite(value), u, np.nan), shared, shape, [each.name for each in sources])
-    # The mean over a part reduces a spike as well: by as much as parts of twice the width reduce it further
+    # The mean over a part reduces a spike as well, in proportion to its width: by as much as parts of twice the width
+    # reduce it further
     wide = np.repeat(shape.reshape(2, -1, 2).mean(axis=2), 2, axis=1)
-    lost, less = (evaluate(np.repeat(value, parts, axis=1) + each) for each in (shape, wide))
-    return replace(its, covariance=its.covariance + np.diag((lost - less) ** 2)), described
+    fine, less = (evaluate(np.repeat(value, parts, axis=1) + each) for each in (shape, wide))
+    lost = fine - less
+    return replace(its, value=its.value + lost, covariance=its.covariance + np.diag(lost**2)), described
 
 
 def of_path(
@@ -153,6 +155,7 @@ def of_path(
         seed=0,
         bias_uncertainty=(FLAT - POINTED) / FLAT,
         skewed=True,
+        corrected=True,
     )
     value = extremes.value - extremes.bias
     value = np.where(np.isin(NAMES, POSITIVE), np.maximum(value, 0.0), value)
