@@ -12,6 +12,7 @@ from errormotion.datasets.maps.known import known_map
 from errormotion.datasets.maps.proposal import Proposal, propose
 from errormotion.datasets.maps.writing import text_of, write_map
 from errormotion.errors import DatasetError
+from tests.support.coded import raises
 
 BEAMS = {
     "values.beam_origin": '["6 0 10 mm", "6 0 50 mm", "0 6 10 mm", "0 6 50 mm", "0 0 -1 mm"]',
@@ -221,6 +222,10 @@ def test_directions_may_be_signs_of_one(tmp_path) -> None:
         ("Messung der Z-Achse\n" + POSITIONING, "Z"),
         (POSITIONING.replace("Abweichung", "EXX"), "X"),
         (POSITIONING, ""),
+        ("Pruefung Z\nStellung Y-Achse: 200 mm\n" + POSITIONING, ""),
+        ("Stellung Y-Achse: 200 mm\n" + POSITIONING, ""),
+        ("Pruefung Z\nY-Achse geklemmt\n" + POSITIONING, ""),
+        ("Temperatur 20 °C, Achse Y\n" + POSITIONING, "Y"),
     ],
 )
 def test_the_axis_is_that_of_a_title_or_a_line_above(tmp_path, text: str, axis: str) -> None:
@@ -440,3 +445,63 @@ def test_an_answer_without_effect_is_refused(tmp_path, text: str, key: str, answ
 def test_answers_that_only_other_schemas_have_are_ignored(tmp_path) -> None:
     found = propose([file_of(tmp_path, POSITIONING)], answers={"values.bar_radius": "5 mm"})
     assert "values" not in found.map
+
+
+@pytest.mark.parametrize(
+    ("line", "sign", "value"),
+    [
+        ("Bar radius: 1,250 mm", ".", ""),
+        ("Bar radius: 1.250 mm", ".", "1.250 mm"),
+        ("Bar radius: 0,25 mm", ".", "0.25 mm"),
+        ("Bar radius: 1,250 mm", ",", "1.250 mm"),
+        ("Bar radius: 1.250 mm", ",", ""),
+        ("Bar radius: 0.25 mm", ",", "0.25 mm"),
+        ("Bar radius: 1.250,5 mm", ",", ""),
+    ],
+)
+def test_a_value_above_has_the_decimal_sign_of_its_table(tmp_path, line: str, sign: str, value: str) -> None:
+    text = SPINDLE.replace("Maschine: M7", line)
+    text = (
+        text if sign == "," else text.replace(f"{line}\n", "").replace(",", ".").replace("\nZeit", f"{line}\nZeit", 1)
+    )
+    proposed = {question.key: question.proposed for question in propose([file_of(tmp_path, text)]).questions}
+    assert proposed["values.bar_radius"] == value
+
+
+def test_temperatures_that_may_be_of_either_unit_are_asked(tmp_path) -> None:
+    log = "Zeit [s];T1\n" + "".join(f"{60 * k};7{k}\n" for k in range(5))
+    assert [question.key for question in propose([file_of(tmp_path, log)]).open] == ["units.temperature"]
+
+
+@pytest.mark.parametrize(
+    ("key", "answer"),
+    [
+        ("format.foo", "x"),
+        ("format.skip", "abc"),
+        ("format.decimal", "x"),
+        ("format.missing", "a"),
+        ("format.encoding", "zip"),
+        ("format.encoding", "nothing"),
+        ("values.bar_radius", "{a=1}"),
+    ],
+)
+def test_answers_of_another_kind_are_refused_as_answers(tmp_path, key: str, answer: str) -> None:
+    with raises("map.answer") as caught:
+        propose([file_of(tmp_path, SPINDLE)]).answered({key: answer})
+    assert str(caught.value).startswith(key)
+
+
+def test_lists_of_answers_about_the_format_are_read(tmp_path) -> None:
+    file = file_of(tmp_path, SPINDLE.replace("1002", "-9999", 1))
+    proposal = propose([file]).answered({"format.missing": '["-9999"]', "format.skip": "1"})
+    write_map(accepted(proposal, BEAMS), tmp_path / "map.toml")
+    assert import_files([file], tmp_path / "map.toml")["distance"].isnull().any("time").sum() == 1
+
+
+def test_answers_do_not_recognise_the_columns_again(tmp_path, monkeypatch) -> None:
+    proposal = propose([file_of(tmp_path, SENSORS)])
+    monkeypatch.setattr("errormotion.datasets.maps.proposal.fit", None)
+    first = proposal.answered({"columns.distance.X1": "Sensor 3"})
+    second = proposal.answered({"machine": "M7"})
+    assert first.map["columns"]["distance"]["X1"] == "Sensor 3"
+    assert second.map["columns"]["distance"]["X1"] == "Sensor 1"

@@ -15,6 +15,8 @@ from errormotion.datasets.schemas import variants
 from errormotion.datasets.tables.table import same
 from errormotion.datasets.text.table_reader import FREEDOM
 
+_NO_TEXTS = ("header", "skip", "missing")
+
 
 def map_of(
     parts: Sequence[Fit],
@@ -57,7 +59,7 @@ def map_of(
         own: dict[str, Any] = {}
         if len(paths) > 1 and (pattern := _pattern(table.path.name, [path.name for path in paths])):
             own["file"] = pattern
-        stated = dict(form)
+        stated = format_of(form)
         if table.form.sheet and (shared.count(table.path) > 1 or len(parts) > 1):
             stated["sheet"] = table.form.sheet
         if stated:
@@ -76,6 +78,11 @@ def map_of(
     if kind:
         found["kind"] = kind
     return found
+
+
+def format_of(form: Mapping[str, str]) -> dict[str, Any]:
+    """Return answers about the format as data: those that are no texts are values in TOML."""
+    return {key: value_of(text) if key in _NO_TEXTS else text for key, text in form.items()}
 
 
 def _part(part: Fit, given: Mapping[str, str]) -> dict[str, Any]:

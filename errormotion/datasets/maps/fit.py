@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,11 @@ class Fit:
     lacking: list[Row] = field(default_factory=list)
     score: float = 0.0
     ways: tuple[str, ...] = ()
+
+    def copy(self) -> Fit:
+        """Return a fit with columns of its own."""
+        columns = [replace(each, labels=dict(each.labels)) for each in self.columns]
+        return replace(self, columns=columns, labels=dict(self.labels), lacking=list(self.lacking))
 
     @property
     def used(self) -> set[int]:

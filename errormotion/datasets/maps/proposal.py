@@ -10,9 +10,9 @@ from types import MappingProxyType
 from typing import Any
 
 from errormotion import plugins
-from errormotion.datasets.files.tomlfile import nearest
+from errormotion.datasets.files.tomlfile import check, nearest
 from errormotion.datasets.maps.columns import Content, contents
-from errormotion.datasets.maps.content import map_of
+from errormotion.datasets.maps.content import format_of, map_of
 from errormotion.datasets.maps.fit import Fit, approached, fit, further
 from errormotion.datasets.maps.questions import APPROACH, Choice, Question, is_column, place_of, questions_of
 from errormotion.datasets.maps.reading import kind_of
@@ -125,6 +125,7 @@ class _State:
     form: Mapping[str, str] = field(default_factory=dict)
     chosen: RawSchema | None = None
     checked: str = ""
+    fits: tuple[tuple[Fit, int], ...] | None = None
 
 
 def propose(
@@ -165,8 +166,10 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
             return _unreadable(state, error)
         read = tuple(tuple(contents(table)) for table in tables)
         counts = tuple(len(table.lines) for table in tables)
-        state = replace(state, columns=read, counts=counts, form=form)
-    fits = _fits(state)
+        state = replace(state, columns=read, counts=counts, form=form, fits=None)
+    if state.fits is None:
+        state = replace(state, fits=tuple(_fits(state)))
+    fits = [(each.copy(), k) for each, k in state.fits or ()]  # answers change a copy
     candidates = tuple(Choice(each.raw.title, _described(each.raw)) for each, _ in fits)
     wanted = state.answers.get("raw", "")
     if wanted and wanted not in {each.value for each in candidates}:
@@ -231,7 +234,10 @@ def _described(raw: RawSchema) -> str:
 
 
 def _tables(path: Path, form: Mapping[str, str]) -> list[Table]:
-    return read_tables(path, Format.model_validate(dict(form)))
+    known, mistakes = check(format_of(form), Format, prefix=("format",), edge=False)
+    if known is None:
+        raise DatasetError("; ".join(mistakes), code="map.answer")
+    return read_tables(path, known)
 
 
 def _unreadable(state: _State, error: DatasetError) -> Proposal:

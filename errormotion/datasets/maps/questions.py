@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from errormotion.datasets.files.tomlfile import check
 from errormotion.datasets.files.tomltext import value_of
 from errormotion.datasets.maps.columns import DATES, Content
 from errormotion.datasets.maps.fit import ALTERNATING, Assigned, Fit, label_of
@@ -172,13 +173,17 @@ def _attributes(main: Fit, above: Sequence[str], answers: Mapping[str, str]) -> 
 
 
 def _attribute(name: str, allowed: Sequence[str], main: Fit, above: Sequence[str]) -> str:
-    """Return the value of an attribute that a freedom, a title or a line of the file states; empty if none does."""
+    """Return the value of an attribute that a freedom, a title or a line of the file states; empty if none does.
+
+    A line with another letter of these leaves it open: a second axis may be the measured one.
+    """
     words = {name.lower(), *(("achse", "axis") if name == "axis" else ())}
     found = [each.key[-1] for each in main.columns if re.search(r"\.E[XYZABC][XYZABC]$", each.key)]
     scalars = [each for each in main.columns if each.name.startswith("target") and "." not in each.key]
     for each in scalars:  # the position of an axis names it: Pos. X
         found += [value for value in allowed if value.lower() in tokens(each.column.title)]
-    for text in (*above, *(each.column.title for each in main.columns)):
+    lines_of_no_value = [line for line in above if not _STATED.match(line)]  # Y-Achse: 200 mm is a place
+    for text in (*lines_of_no_value, *(each.column.title for each in main.columns)):
         own = tokens(text)
         for value in allowed:
             sign = value.lower()
@@ -187,6 +192,9 @@ def _attribute(name: str, allowed: Sequence[str], main: Fit, above: Sequence[str
             joined = any(token in (sign + word, word + sign) for token in own for word in words)
             if beside or joined:
                 found.append(value)
+    letters = {value.lower(): value for value in allowed if len(value) == 1}
+    lines = [re.sub(r"°\s*[CF]\b", "", line) for line in above]
+    found += [letters[token] for line in lines for token in tokens(line) if found and token in letters]
     known = [value for value in dict.fromkeys(found) if value in allowed]
     return known[0] if len(known) == 1 else ""
 
@@ -289,7 +297,7 @@ def _unit(column: Content, row: Row) -> str:
         return ""
     low, high = float(known.min()), float(known.max())
     if row.unit == "degC":
-        return "degC" if low > -60 and high < 90 else ""
+        return "degC" if low > -60 and high < 50 else ""  # above, a room in degF reads alike
     if row.unit == "m" and (row.low, row.high) == POSITION:
         return "mm" if 10 <= max(-low, high) <= 20000 else ""
     if row.unit == "s":
@@ -304,13 +312,14 @@ def _values(main: Fit, above: Sequence[str]) -> list[Question]:
     found = []
     rows = [*main.lacking, *(row for row in main.raw.rows if row.name in main.raw.asked)]
     assigned = {each.name for each in main.columns}
+    decimal = main.columns[0].column.table.form.decimal
     for row in rows:
         if row.name in assigned:
             continue
         unit = f", with its unit, such as {_example(row, main.raw)}" if row.unit not in ("", "1") else ""
         dims = f" ({', '.join(row.dims)})" if row.dims else ""
         text = f"{row.name}{dims}: {row.meaning}{unit}"
-        found.append(Question(f"values.{row.name}", text, (), _stated(row, above), row.required))
+        found.append(Question(f"values.{row.name}", text, (), _stated(row, above, decimal), row.required))
     return found
 
 
@@ -323,19 +332,32 @@ def _example(row: Row, raw: RawSchema) -> str:
     return f"'{each}'" if len(counts) == 1 else "[" + ", ".join([f"'{each}'"] * min(counts[0], 5)) + "]"
 
 
-def _stated(row: Row, above: Sequence[str]) -> str:
+def _stated(row: Row, above: Sequence[str], decimal: str) -> str:
     """Return the value of a variable with its unit in the lines above the table; empty if there is none."""
     if row.dims or row.unit in ("", "1"):
         return ""
     for line in above:
         match = _STATED.match(line)
         if match and likeness(match[1], row.name) >= 2.0:
-            text = match[2].replace(",", ".")
-            number = re.match(r"[+-]?[0-9.eE+-]*[0-9.]", text)
-            unit = fitting_unit(text[number.end() :].strip(), row) if number else ""
+            found = re.match(r"[+-]?[0-9.,eE+-]*[0-9.]", match[2])
+            number = _plain(found[0], decimal) if found else ""
+            unit = fitting_unit(match[2][found.end() :].strip(), row) if found else ""
             if number and unit:
-                return f"{number[0]} {unit}"
+                return f"{number} {unit}"
     return ""
+
+
+def _plain(text: str, decimal: str) -> str:
+    """Return a number with a point as decimal sign; empty if its sign may separate thousands.
+
+    The decimal sign of the table is that of the lines above it; another one is none if three digits follow it.
+    """
+    signs = re.findall("[.,]", text)
+    if len(signs) > 1:
+        return ""
+    if signs and signs[0] != decimal and re.fullmatch(r"[+-]?[1-9][0-9]{0,2}[.,][0-9]{3}", text):
+        return ""
+    return text.replace(",", ".")
 
 
 def _machine(above: Sequence[str]) -> str:
@@ -358,7 +380,10 @@ def _check(question: Question, answer: str, main: Fit) -> None:
         names = Names.of([raw])
         rows = {**{row.name: row for row in raw.stated}, **names.rows}
         value = value_of(answer)
-        entry = MappedValue.model_validate(value if isinstance(value, dict) else {"value": value})
+        content = value if isinstance(value, dict) else {"value": value}
+        entry, wrong = check(content, MappedValue, prefix=("values", name), edge=False)
+        if entry is None:
+            raise DatasetError("; ".join(wrong), code="map.answer")
         read_value(name, entry, table, replace(names, rows=rows), Found(), mistakes)
         if mistakes.count:
             raise DatasetError(f"{question.key}: {mistakes.first.removeprefix(f'values.{name}: ')}", code="map.answer")

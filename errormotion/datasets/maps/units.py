@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 from errormotion.datasets.schemas import Row
 from errormotion.datasets.tables.dates import fitting
@@ -49,12 +50,18 @@ def fitting_unit(text: str, row: Row, freedom: str = "") -> str:
         for goal in goals:
             if not unit or is_unclear(unit):
                 continue
-            try:
-                convert(1.0, unit, goal)
-            except DatasetError:
-                continue
-            return unit
+            if _converts(unit, goal):
+                return unit
     return ""
+
+
+@lru_cache(maxsize=4096)
+def _converts(unit: str, goal: str) -> bool:
+    try:
+        convert(1.0, unit, goal)
+    except DatasetError:
+        return False
+    return True
 
 
 def stated_unit(table: Table, column: int) -> str:

@@ -24,9 +24,11 @@ def _known_encoding(name: str) -> str:
     if name == "auto":
         return name
     try:
-        return codecs.lookup(name).name
-    except LookupError as error:
+        known = codecs.lookup(name).name
+        " ".encode(known)  # refuses codecs of no text, such as 'zip'
+    except (LookupError, ValueError) as error:
         raise ValueError("expected an encoding such as 'utf-8', 'cp1252' or 'utf-16'") from error
+    return known
 
 
 def _known_zone(name: str) -> str:

@@ -80,8 +80,8 @@ def _draft(paths: Sequence[Path], runs: Path, machines: Sequence[str], answers: 
     found = propose(paths)
     if not found.questions and not found.schema:
         raise DatasetError(found.notes[0], code="add.file.unknown")
-    for key in sorted(answers, key=lambda each: each not in ("format.decimal", "raw")):
-        found = found.answered({key: answers[key]})
+    if answers:
+        found = found.answered(answers)
     machine = str(found.map.get("machine", ""))
     known = load_machines(runs).answers(machine, found.schema)
     questions = tuple(
