@@ -505,3 +505,12 @@ def test_answers_do_not_recognise_the_columns_again(tmp_path, monkeypatch) -> No
     second = proposal.answered({"machine": "M7"})
     assert first.map["columns"]["distance"]["X1"] == "Sensor 3"
     assert second.map["columns"]["distance"]["X1"] == "Sensor 1"
+
+
+def test_the_words_of_a_method_are_those_of_its_schema() -> None:
+    from errormotion.datasets.maps.words import likeness
+
+    assert likeness("Tracker", "station") == likeness("Kugel", "ball") == 0.0
+    assert likeness("n", "spindle_speed") == 1.0  # a speed
+    assert likeness("Tracker", "station", ("tracker",)) == 3.0
+    assert likeness("Drehzahl Spindel", "spindle_speed", ("drehzahl",)) == 2.5

@@ -27,11 +27,9 @@ humidity: feuchte luftfeuchte rh hum feuchtigkeit rf
 air: luft lufttemperatur luftdruck luftfeuchte
 feed: vorschub
 load: last auslastung
-station: setup standort aufstellung tracker stationen stand aufbau
+station: setup standort aufstellung stationen stand aufbau
 run: lauf zyklus durchgang messreihe wiederholung cycle runs repeat messlauf
 approach: richtung direction anfahrrichtung dir way anfahrt
-sphere: kugel ball
-ball: kugel sphere
 plane: ebene fläche
 sensor: taster fühler kanal probe
 centre: center mittelpunkt zentrum mitte
@@ -49,8 +47,6 @@ SYNONYMS = {
 }
 """Words of titles by a word of the names of variables and dimensions."""
 
-_NAMED = {"spindle_speed": frozenset(["drehzahl", "spindeldrehzahl", "rpm", "upm", "n"])}
-"""Words that state a variable of several words on their own."""
 _FORWARD = """
 forward forwards fwd + vor vorwärts hin up pos positiv positive increasing v f auf plus
 """
@@ -108,7 +104,7 @@ def likeness(title: str, name: str, further: Iterable[str] = ()) -> float:
     if plain == name.lower() or plain in {"_".join(_TOKEN.findall(each.lower())) for each in stated}:
         return 3.0
     letters = [token for token in own if not token.isdigit()]
-    single = _NAMED.get(name, frozenset()) | frozenset(each for each in stated if len(_TOKEN.findall(each)) == 1)
+    single = frozenset(each for each in stated if len(_TOKEN.findall(each)) == 1)
     # every part of the name counts: an air temperature is no spindle temperature
     parts = [SYNONYMS.get(part, frozenset([part])) for part in name.lower().split("_")]
     hits = sum(any(_says(token, words) for token in letters) for words in parts)

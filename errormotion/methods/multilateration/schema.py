@@ -76,5 +76,6 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        words={"station": ("tracker",)},
     ),
 )

@@ -14,6 +14,7 @@ def flag_text(flag: float) -> str:
 
 
 _TIME = Row("time", ("time",), "s", -NO_LIMIT, NO_LIMIT, "time of the probing, increasing")
+_WORDS = {"ball": ("sphere", "kugel"), "spindle_speed": ("drehzahl", "spindeldrehzahl", "rpm", "upm", "n")}
 _NOMINAL = Row("ball_nominal", ("ball", "direction"), "m", *POSITION, "nominal centre of each ball", required=False)
 _STATE = (
     Row("temperature", ("time", "sensor"), "degC", -40.0, 200.0, "at each probing; NaN = unknown", required=False),
@@ -50,6 +51,7 @@ RAW_SCHEMAS = (
         ),
         sizes={**DIRECTION, "direction_": 3},
         labels=XYZ,
+        words=_WORDS,
     ),
     RawSchema(
         SCHEMA,
@@ -99,6 +101,7 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        words=_WORDS,
     ),
 )
 

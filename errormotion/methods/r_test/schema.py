@@ -72,6 +72,7 @@ RAW_SCHEMAS = (
         ),
         sizes=DIRECTION,
         labels=XYZ,
+        words={"sphere": ("ball", "kugel")},
         attributes={"axis": ("A", "B", "C")},
     ),
 )

@@ -96,7 +96,10 @@ RAW_SCHEMAS = (
         sizes={**DIRECTION, "channel": 5, "height": 2, "p": 6, "p_": 6},
         labels={**XYZ, "channel": CHANNELS, "height": ("L1", "L2")},
         aliases={"reading": "distance"},
-        words={"distance": ("sensor", "messtaster", "gap")},
+        words={
+            "distance": ("sensor", "messtaster", "gap"),
+            "spindle_speed": ("drehzahl", "spindeldrehzahl", "rpm", "upm", "n"),
+        },
         stated=(
             Row("beam_origin_uncertainty", ("channel",), "m", *NOISE, "standard uncertainty of each coordinate"),
             Row("beam_direction_uncertainty", ("channel",), "rad", 0.0, 0.1, "standard uncertainty across the beam"),
