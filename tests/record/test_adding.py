@@ -1,6 +1,7 @@
 """Imported runs of every method, and answers that are kept for a machine."""
 
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from errormotion.datasets import provenance
 from errormotion.plugins import MethodSubject
 from errormotion.record.adding import machines
 from errormotion.record.adding.add import add
+from errormotion.record.adding.exclusive import exclusive
 from errormotion.record.adding.questions import take_proposals
 from errormotion.record.adding.request import Request
 from errormotion.report import write_run_report
@@ -86,4 +88,42 @@ def test_a_file_that_is_a_folder_or_stated_twice_is_refused(tmp_path: Path) -> N
         call(tmp_path / "a")
     with raises("add.file.twice"):
         call(tmp_path / "b.csv", tmp_path / "c.csv")
+    (tmp_path / "other").mkdir()
+    for name in ("B.csv", "b.CSV"):  # one file on a disk that ignores case
+        (tmp_path / "other" / name).write_text("2")
+        with raises("add.file.twice"):
+            call(tmp_path / "b.csv", tmp_path / "other" / name)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_file_that_is_added_meanwhile_becomes_one_run(tmp_path: Path) -> None:
+    subject: Any = SUBJECTS[0].values[0]
+    raw, _ = subject.make(1)
+    file = datasets.save(raw.assign_attrs(machine="VMC 850"), tmp_path / "a.nc")
+
+    def request(again: bool = False) -> Request:
+        settings = subject.effective_settings()
+        return Request((file,), tmp_path / "runs", settings=lambda model: settings, again=again)
+
+    others: list[Path] = []
+
+    def stage(name: str) -> None:
+        if name == "reading the files" and not others:
+            others.append(add(request(), take_proposals).folder.path)
+
+    with raises("add.known.meanwhile"):
+        add(request(), take_proposals, stage=stage)
+    assert [each.parent for each in (tmp_path / "runs").glob("*/run.json")] == others
+    assert add(request(again=True), take_proposals).folder.path not in others
+
+
+def test_answers_of_two_processes_are_all_kept(tmp_path: Path) -> None:
+    file = tmp_path / machines.FILE
+    with exclusive(tmp_path):
+        other = Thread(target=machines.remember, args=(tmp_path, "A", "a/1", {"values.x": "1 mm"}))
+        other.start()
+        other.join(0.3)
+        assert not file.exists()
+        file.write_text('schema = "errormotion.machines/1"\n[machines.A."a/1"]\n"values.y" = "2 mm"\n')
+    other.join()
+    assert machines.load_machines(tmp_path).answers("A", "a/1") == {"values.x": "1 mm", "values.y": "2 mm"}

@@ -10,7 +10,7 @@ import json
 import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,6 +31,7 @@ from errormotion.datasets.maps.questions import Question
 from errormotion.errors import DatasetError, RunError, code_of
 from errormotion.plugins import Method
 from errormotion.record.adding.differences import differences
+from errormotion.record.adding.exclusive import exclusive
 from errormotion.record.adding.machines import remember
 from errormotion.record.adding.mapping import MapOfFiles, map_of_files, of_machine
 from errormotion.record.adding.originals import KEPT, MAP, Original, keep, originals_of, run_of
@@ -38,6 +39,7 @@ from errormotion.record.adding.questions import Ask
 from errormotion.record.adding.reading import owner_of, read_raw
 from errormotion.record.adding.request import Request
 from errormotion.record.adding.statement import Statement, copy_logo, load_statement
+from errormotion.record.runs.listing import list_runs
 from errormotion.tolerances.table import load_tolerances
 
 log = logging.getLogger(__name__)
@@ -102,7 +104,7 @@ def add(
         return Added(before, known=True)
     work = _Adding(request, originals, ask, stage)
     if before is None:
-        folder = RunFolder.create(request.runs, _name(request.files[0].stem), uuid4().hex[:8], {}, work.fill)
+        folder = _created(request, work)
     else:
         folder = before
         with folder.locked():
@@ -119,6 +121,30 @@ def add(
         folder.save(status="finished", reason="")
     remember(request.runs, str(folder.data["bench"]["machine"]), work.schema, work.map.answers)
     return Added(folder, known=False, notes=work.notes)
+
+
+def _created(request: Request, work: _Adding) -> RunFolder:
+    """Return the new run folder.
+
+    Raises
+    ------
+    DatasetError
+        Another process has added the files meanwhile.
+    """
+    with ExitStack() as last:
+
+        def fill(folder: Path) -> dict[str, Any]:
+            entries = work.fill(folder)
+            last.enter_context(exclusive(request.runs))  # until the folder has its name
+            if not request.again and (other := run_of(work.originals.values(), list_runs([request.runs]))) is not None:
+                names = ", ".join(path.name for path in request.files)
+                raise DatasetError(
+                    f"{names}: was added by another process meanwhile, {other.path}; --again adds it once more",
+                    code="add.known.meanwhile",
+                )
+            return entries
+
+        return RunFolder.create(request.runs, _name(request.files[0].stem), uuid4().hex[:8], {}, fill)
 
 
 class _Adding:

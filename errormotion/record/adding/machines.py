@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from errormotion.datasets.files import tomlfile, tomltext
 from errormotion.datasets.files.writing import replace_text, writing
+from errormotion.record.adding.exclusive import exclusive
 
 FILE = "machines.toml"
 SCHEMA = "errormotion.machines/1"
@@ -58,12 +59,15 @@ def remember(runs: Path, machine: str, schema: str, answers: Mapping[str, str]) 
         The file is too large to be changed, or cannot be written.
     """
     new = {key: text for key, text in answers.items() if key.startswith(_KEPT) and text}
-    known = load_machines(runs).answers(machine, schema)
-    if not new or all(known.get(key) == text for key, text in new.items()):
+    if not new:
         return
     path = runs / FILE
-    text = path.read_text(encoding="utf-8-sig") if path.exists() else _HEAD
-    for key, answer in new.items():
-        text = tomltext.with_value(text, ("machines", machine, schema, key), answer)
-    with writing(path):
-        replace_text(path, text)
+    with exclusive(runs):
+        known = load_machines(runs).answers(machine, schema)
+        if all(known.get(key) == text for key, text in new.items()):
+            return
+        text = path.read_text(encoding="utf-8-sig") if path.exists() else _HEAD
+        for key, answer in new.items():
+            text = tomltext.with_value(text, ("machines", machine, schema, key), answer)
+        with writing(path):
+            replace_text(path, text)

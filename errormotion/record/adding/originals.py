@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -60,13 +61,22 @@ def originals_of(paths: Sequence[Path]) -> dict[Path, Original]:
                 f"{path}: expected a file; {error.strerror}. A folder is added file by file.",
                 code="add.file.unreadable",
             ) from error
-        if twice := [other for other, each in found.items() if path.name == each.name or digest == each.sha256]:
+        if twice := [
+            other for other, each in found.items() if same_name(path.name, each.name) or digest == each.sha256
+        ]:
             raise DatasetError(
-                f"{path}: has the name or the content of {twice[0]}; state each file of a run once",
+                f"{path}: has the name or the content of {twice[0]}, where case makes no difference; state each file "
+                "of a run once, and rename others",
                 code="add.file.twice",
             )
         found[path] = Original(path.name, digest, size)
     return found
+
+
+def same_name(one: str, other: str) -> bool:
+    """Return whether two names are those of one file on a disk that ignores case, or keeps composed characters."""
+    first, second = (unicodedata.normalize("NFC", name).casefold() for name in (one, other))
+    return first == second
 
 
 def sha256_of(path: Path) -> str:
