@@ -3,6 +3,7 @@
 import json
 import os
 import time
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -241,3 +242,33 @@ def test_files_of_the_record_are_added_once_more_on_request_only(controlling: An
         found.append(added["run"])
     assert found[1] == found[0] != found[2]
     assert {path.parent.name for path in runs.glob("*/run.json")} == {*found}
+
+
+def test_what_is_shown_is_saved_and_an_answer_can_be_changed(controlling: Any, tmp_path: Path) -> None:
+    """A log needs no answer: the map of an earlier one of its kind, with corrected columns, is not used for it."""
+    titles = "Time [s];front [°C];back [°C]\n"
+    texts = [titles + "".join(f"{60 * k};{20 + k / 10};{30 + j + k / 10}\n" for k in range(20)) for j in range(2)]
+    saved = []
+    for text, corrected in zip(texts, ({"columns.temperature.front": "back"}, {}), strict=True):
+        key = send(controlling, "a.csv", text)[1]["key"]
+        draft = post(controlling, "/results/add/table.json", key=key, answers=corrected)[1]
+        answers = {"machine": "Mill", **corrected}
+        status, added = post(controlling, "/results/add/save", key=key, answers=answers)
+        assert status == 200, added
+        with (tmp_path / "runs" / added["run"] / "map.toml").open("rb") as file:
+            saved.append(tomllib.load(file))
+        meanings = dict(zip(draft["tables"][0]["titles"], draft["tables"][0]["meanings"], strict=True))
+        columns = saved[-1]["parts"][0]["columns"] if "parts" in saved[-1] else saved[-1]["columns"]
+        assert columns["temperature"][meanings["front [°C]"].partition(".")[2]] == "front [°C]"
+    key = send(controlling, "X.csv", positioning())[1]["key"]
+    draft = post(controlling, "/results/add/table.json", key=key, answers={"attributes.axis": "Y"})[1]
+    [axis] = [each for each in draft["questions"] if each["key"] == "attributes.axis"]
+    assert axis["proposed"] == "Y"
+
+
+def test_errors_name_the_files_without_the_folder_of_the_upload(controlling: Any) -> None:
+    key = send(controlling, "letter.txt", "Dear customer,\nthank you.\n")[1]["key"]
+    status, refused = post(controlling, "/results/add/table.json", key=key, answers={})
+    assert status == 400
+    assert "letter.txt" in refused["error"]
+    assert ".upload-" not in refused["error"]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from tornado.web import HTTPError
 from errormotion.dashboard.pages.page import Guarded
 from errormotion.dashboard.uploads import MAX_UPLOAD, Uploads
 from errormotion.datasets.files.reading import parse_json
+from errormotion.errors import ErrormotionError
 from errormotion.record.adding.add import add
 from errormotion.record.adding.draft import draft_of
 from errormotion.record.adding.questions import take_proposals
@@ -54,6 +56,19 @@ class _Adding(Guarded):
         return key, answers
 
 
+@contextmanager
+def _about(paths: Sequence[Path]) -> Iterator[None]:
+    """Name the files in errors as the person knows them, without the folder of the upload."""
+    try:
+        yield
+    except ErrormotionError as error:
+        text = str(error)
+        for path in paths:
+            text = text.replace(str(path), path.name)
+        error.args = (text,)
+        raise
+
+
 class File(_Adding):
     """A file of an upload; the body of the request is its content."""
 
@@ -74,7 +89,8 @@ class Table(_Adding):
         """Send tables, proposed columns and questions."""
         key, answers = self.body()
         paths = self.uploads.files(key)
-        found = await self.in_slow_thread(draft_of, paths, self.context.lab.runs, answers)
+        with _about(paths):
+            found = await self.in_slow_thread(draft_of, paths, self.context.lab.runs, answers)
         await self.send(found.plain())
 
 
@@ -86,7 +102,8 @@ class Save(_Adding):
         key, answers = self.body()
         again = parse_json(self.request.body).get("again") is True
         paths = self.uploads.files(key)
-        run, known = await self.in_slow_thread(_added, paths, self.context.lab.runs, answers, again)
+        with _about(paths):
+            run, known = await self.in_slow_thread(_added, paths, self.context.lab.runs, answers, again)
         if not known:
             self.uploads.forget(key)
         await self.send({"run": run, "known": known})
@@ -107,7 +124,7 @@ def _added(paths: Sequence[Path], runs: Path, answers: dict[str, str], again: bo
     from errormotion.report import write_run_report
 
     of_files: dict[str, Any] = {key: text for key, text in answers.items() if key != "machine"}
-    request = Request(tuple(paths), runs, machine=answers.get("machine", ""), answers=of_files, again=again)
+    request = Request(tuple(paths), runs, machine=answers.get("machine", ""), answers=of_files, again=again, shown=True)
     found = add(request, take_proposals, report=write_run_report)
     return found.folder.path.name, found.known
 

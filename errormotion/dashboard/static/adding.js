@@ -146,10 +146,17 @@ function typed() {
 function changed(name, value) {
   if (name === "raw" || name.startsWith("format.")) // the columns have other meanings then
     for (const each of Object.keys(answers)) if (!each.startsWith("format.")) delete answers[each];
+  const old = answers[name];
   answers[name] = value;
   return doing(async () => {
     const before = typed();
-    await show();
+    try {
+      await show();
+    } catch (error) { // a refused answer would be refused again with each other one
+      if (old === undefined) delete answers[name];
+      else answers[name] = old;
+      throw error;
+    }
     for (const input of byId("draft-questions").querySelectorAll("[data-key]"))
       if (before[input.dataset.key] && !input.value) input.value = before[input.dataset.key];
   });

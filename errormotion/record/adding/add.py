@@ -324,7 +324,7 @@ def _about(files: Sequence[Path], folder: Path) -> Iterator[None]:
 @contextmanager
 def _failures(folder: RunFolder, request: Request) -> Iterator[None]:
     """Record the failure of a run in its ``run.json`` and its log, and state how to continue."""
-    again = "Repeat 'errormotion add' with the same files, and with other options if necessary, to continue this run."
+    again = "Add the same files again, with other options or answers if necessary, to continue this run."
     try:
         yield
     except KeyboardInterrupt as error:

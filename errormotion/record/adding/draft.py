@@ -29,7 +29,7 @@ class Draft:
     tables : tuple of Preview
         Empty for files that need no map.
     questions : tuple of Question
-        All that the answers leave open; ``proposed`` is also what is known of the machine.
+        All that the files leave open; ``proposed`` is the answer, if there is one, or what is known of the machine.
     notes : tuple of str
     known : str
         Key of the finished run of these files in the record; empty if there is none.
@@ -80,15 +80,19 @@ def _draft(paths: Sequence[Path], runs: Path, machines: Sequence[str], answers: 
     found = propose(paths)
     if not found.questions and not found.schema:
         raise DatasetError(found.notes[0], code="add.file.unknown")
-    if answers:
-        found = found.answered(answers)
+    answered: dict[str, Question] = {}
+    first = {key: text for key, text in answers.items() if key == "raw" or key.startswith("format.")}
+    for new in (first, {key: text for key, text in answers.items() if key not in first}):
+        if new:  # an answer can be changed
+            answered |= {each.key: replace(each, proposed=new[each.key]) for each in found.questions if each.key in new}
+            found = found.answered(new)
     machine = str(found.map.get("machine", ""))
     known = load_machines(runs).answers(machine, found.schema)
     questions = tuple(
         of_machine(each, machines)
         if each.key == "machine"
-        else Question(each.key, each.text, each.choices, known.get(each.key, each.proposed), each.needed)
-        for each in found.questions
+        else replace(each, proposed=answers.get(each.key) or known.get(each.key, each.proposed))
+        for each in (*answered.values(), *found.questions)
     )
     owner = plugins.owner_of_schema(found.schema) if found.schema else None
     return Draft(owner.info.summary if owner is not None else "", found.tables, questions, found.notes)

@@ -73,7 +73,7 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
         return MapOfFiles(map_file)
     if all(is_raw(copy) for copy in copies):
         return MapOfFiles()
-    if map_file.is_file() and not leaves(folder, map_file) and not request.answers:
+    if map_file.is_file() and not leaves(folder, map_file) and not request.answers and not request.shown:
         return MapOfFiles(map_file)
     stated = {"machine": request.machine, "attributes.axis": request.axis}
     known = {key: text for key, text in stated.items() if text} | dict(request.answers)
@@ -88,7 +88,8 @@ def map_of_files(request: Request, copies: Sequence[Path], folder: Path, ask: As
     found = propose(copies, tuple(schemas), answers=known)
     if not found.questions and not found.schema:
         raise DatasetError(f"{found.notes[0]}; describe them by a map: --map FILE", code="add.file.unknown")
-    if not request.answers and (earlier := known_map(copies, _maps(request.record))) is not None:
+    proposed = bool(request.answers) or request.shown
+    if not proposed and (earlier := known_map(copies, _maps(request.record))) is not None:
         contradiction = _contradiction(read_toml(earlier), found, known, request.record.machines, ask)
         if not contradiction:
             replace_bytes(map_file, earlier.read_bytes())

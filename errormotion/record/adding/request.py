@@ -39,6 +39,8 @@ class Request:
         Answers to questions, by their keys.
     again : bool
         Whether files that are in the record become another run.
+    shown : bool
+        Whether a person has seen the proposal, so that no map of an earlier run is used instead of it.
     """
 
     files: tuple[Path, ...]
@@ -54,6 +56,7 @@ class Request:
     settings: Callable[[Any], Any] = lambda model: model()
     answers: Mapping[str, str] = field(default_factory=dict)
     again: bool = False
+    shown: bool = False
 
     @cached_property
     def record(self) -> Listing:
