@@ -514,3 +514,9 @@ def test_the_words_of_a_method_are_those_of_its_schema() -> None:
     assert likeness("n", "spindle_speed") == 1.0  # a speed
     assert likeness("Tracker", "station", ("tracker",)) == 3.0
     assert likeness("Drehzahl Spindel", "spindle_speed", ("drehzahl",)) == 2.5
+
+
+def test_a_table_of_too_many_columns_is_refused(tmp_path) -> None:
+    wide = "\n".join(";".join(f"{text}{k}" for k in range(1001)) for text in ("T", "", "1"))
+    with raises("file.too_large"):
+        propose([file_of(tmp_path, wide)])

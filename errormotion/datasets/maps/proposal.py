@@ -25,6 +25,8 @@ from errormotion.kinematics.iso import DOF
 
 __all__ = ["Choice", "Preview", "Proposal", "Question", "propose"]
 
+MAX_COLUMNS = 1000
+"""Largest number of columns of which a map is proposed."""
 _ROWS = 8
 """Number of rows of a preview."""
 _NONE: Mapping[str, str] = MappingProxyType({})
@@ -164,6 +166,13 @@ def _proposal(state: _State, new: set[str]) -> Proposal:
             if error.code != "file.numbers.ambiguous" or "decimal" in form:
                 raise
             return _unreadable(state, error)
+        count = sum(len(table.titles) for table in tables)
+        if count > MAX_COLUMNS:
+            raise DatasetError(
+                f"{state.paths[0]}: expected at most {MAX_COLUMNS} columns for a proposed map; found {count}; describe "
+                "those with readings in a map",
+                code="file.too_large",
+            )
         read = tuple(tuple(contents(table)) for table in tables)
         counts = tuple(len(table.lines) for table in tables)
         state = replace(state, columns=read, counts=counts, form=form, fits=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from functools import cache
+from functools import lru_cache
 
 from errormotion.datasets.tables.table import name_of, same
 from errormotion.datasets.text.layout import BACKWARD, FORWARD
@@ -81,7 +81,7 @@ _OTHER_ERRORS = re.compile(
 _TOKEN = re.compile(r"[^\W\d_]+|[0-9]+|[+\-–]")
 
 
-@cache
+@lru_cache(maxsize=100_000)
 def tokens(title: str) -> tuple[str, ...]:
     """Return the words and numbers of a title without its unit, in lower case."""
     return tuple(_TOKEN.findall(name_of(same(title)).lower()))
@@ -96,10 +96,14 @@ def words_of(name: str, further: Iterable[str] = ()) -> frozenset[str]:
 
 def likeness(title: str, name: str, further: Iterable[str] = ()) -> float:
     """Return how well a title fits the name of a variable or dimension: 0 (no common word) to 3 (the name)."""
+    return _likeness(title, name, tuple(further))
+
+
+@lru_cache(maxsize=100_000)
+def _likeness(title: str, name: str, stated: tuple[str, ...]) -> float:
     own = tokens(title)
     if not own:
         return 0.0
-    stated = tuple(further)
     plain = "_".join(own)
     if plain == name.lower() or plain in {"_".join(_TOKEN.findall(each.lower())) for each in stated}:
         return 3.0
