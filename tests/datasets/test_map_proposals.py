@@ -520,3 +520,23 @@ def test_a_table_of_too_many_columns_is_refused(tmp_path) -> None:
     wide = "\n".join(";".join(f"{text}{k}" for k in range(1001)) for text in ("T", "", "1"))
     with raises("file.too_large"):
         propose([file_of(tmp_path, wide)])
+
+
+@pytest.mark.parametrize("ways", [(1, 1), (1, -1), (-1, -1)])
+def test_the_direction_of_numbered_runs_is_that_of_their_positions(tmp_path, ways: tuple[int, ...]) -> None:
+    """A column with the axis in each row, whose Z is no direction, is beside that of the runs."""
+    head = "Lauf;Achse;Sollposition [mm];Abweichung [µm]\n"
+    rows = "".join(f"{run};Z;{p};{run},5\n" for run, way in enumerate(ways) for p in (0, 100, 200)[::way])
+    file = file_of(tmp_path, head + rows)
+    write_map(accepted(propose([file]), {"attributes.axis": "Z", "columns.deviation": "EZZ"}), tmp_path / "map.toml")
+    raw = import_files([file], tmp_path / "map.toml")
+    there = raw["deviation"].notnull().any(("target", "freedom"))
+    counts = {str(way): int(there.sel(approach=way).sum()) for way in raw["approach"].values}
+    assert counts.get("forward", 0) == ways.count(1)
+    assert counts.get("backward", 0) == ways.count(-1)
+
+
+def test_runs_that_are_sorted_by_target_state_no_direction(tmp_path) -> None:
+    head = "Lauf;Sollposition [mm];Abweichung [µm]\n"
+    rows = "".join(f"{run};{p};{run},5\n" for p in (0, 100, 200) for run in (1, 2))
+    assert "sequence" not in propose([file_of(tmp_path, head + rows)]).map

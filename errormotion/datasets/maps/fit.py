@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -448,10 +449,22 @@ def _runs(schema: _Schema, found: Fit, rest: list[Content], lacking: Sequence[st
     if set(lacking) == set(SEQUENCE):
         found.sequence = place.column
         return True
+    if set(lacking) == {"approach", "target"} and _is_pass_each(found.labels["run"][0].texts, number.tolist()):
+        del found.labels["run"]
+        found.sequence = place.column
+        return True
     if "target" in lacking:  # run and direction have columns of their own
         found.labels["target"] = (place.column, {})
         lacking = [dim for dim in lacking if dim != "target"]
     return not lacking
+
+
+def _is_pass_each(runs: Sequence[str], number: Sequence[int]) -> bool:
+    """Return whether the rows of each run follow one another, and visit at least two targets in one direction."""
+    starts = [0, *(k for k in range(1, len(runs)) if runs[k] != runs[k - 1]), len(runs)]
+    passes = [number[first:last] for first, last in pairwise(starts)]
+    ordered = all(each in (sorted(set(each)), sorted(set(each), reverse=True)) and len(each) > 1 for each in passes)
+    return ordered and len(passes) == len(set(runs))
 
 
 def _matrix(schema: _Schema, found: Fit, rest: list[Content], place: Assigned, lacking: Sequence[str]) -> bool:
