@@ -120,7 +120,7 @@ def of_noisy_values(
     deviation = deviation * more
     extra = np.square(bias_uncertainty * bias)
     if skewed:
-        tail = more * np.abs(np.quantile(again, (0.025, 0.975), axis=0) - mean).max(axis=0) / 2.0
+        tail = np.abs(np.quantile(again, (0.025, 0.975), axis=0) - mean).max(axis=0) / 2.0
         extra = extra + np.maximum(tail**2 - deviation**2, 0.0)
     covariance = np.multiply.outer(more, more) * np.cov(again.T) + (np.diag(extra) if extra.ndim else extra)
     return Extremes(first, bias, np.hypot(deviation, np.sqrt(extra)), covariance)
