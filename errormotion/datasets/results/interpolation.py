@@ -25,6 +25,8 @@ Nothing is extrapolated.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
@@ -202,7 +204,7 @@ def steps(t: Array, values: Array, own: Array, *, together: bool = False) -> Arr
     b[:-1] *= h[:-1] / h[1:]
     before, after = (np.where(np.isfinite(each), each, 0.0) for each in (before, after))
     size = h * (slope - (before + after) / 2)
-    limit = np.concatenate([np.e * after[:1], after[1:]])
+    limit = np.concatenate([math.e * after[:1], after[1:]])
     outside = (slope > np.maximum(before, limit)) | (slope < np.minimum(before, limit))
     v = np.concatenate([np.zeros_like(none), np.nan_to_num(variance), np.zeros_like(none)])
     noise = np.square(a) * v[:-3] + np.square(1 + a) * v[1:-2] + np.square(1 + b) * v[2:-1] + np.square(b) * v[3:]
