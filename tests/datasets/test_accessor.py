@@ -49,6 +49,7 @@ def test_to_another_frame_and_back_changes_nothing(errors_of_seed, seed, pose) -
     assert_same(ds.em.in_frame(pose, "tilted").em.in_frame(pose.inv(), ds.attrs["frame"]), ds)
 
 
+@pytest.mark.filterwarnings("ignore:The point is .* from the origin")
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 1000), point=points, pose=poses)
 def test_point_and_frame_may_be_changed_in_any_order(errors_of_seed, seed, point, pose) -> None:

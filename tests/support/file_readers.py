@@ -26,7 +26,7 @@ from errormotion.campaign.storage.store import committed_length
 from errormotion.datasets.certificates import ATTRIBUTE, certificates_of
 from errormotion.datasets.clock import CLOCK, JOINS, age, notes
 from errormotion.datasets.files import events
-from errormotion.datasets.importing import _reader as log_reader
+from errormotion.datasets.importing import import_files
 from errormotion.datasets.tables.dates import Clock, zone_of
 from errormotion.datasets.tables.mistakes import Mistakes
 from errormotion.datasets.tables.reading import read_table
@@ -176,9 +176,7 @@ def logs(path: Path, log: str, mapping: str) -> object:
     other = path.with_name(name)
     other.write_text(mapping if name == "map.toml" else log)
     log_file, map_file = (path, other) if name == "map.toml" else (other, path)
-    raw = log_reader(map_file)(log_file, map_file)
-    validate(raw)
-    return raw
+    return import_files([log_file], map_file)
 
 
 def readings(path: Path) -> None:
