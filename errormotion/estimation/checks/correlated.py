@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -111,11 +111,14 @@ def correlated(white: Fit, order: Array, series: Index | None = None, *, typical
     problem, at = white.problem, white.linear.at
     near = _linear(problem, at)
 
+    @cache
     def deviance(phi: float) -> float:
         return _deviance(near, at, order, series, phi) + float(np.arctanh(phi) / typical) ** 2
 
-    best = minimize_scalar(deviance, bounds=(0.0, LARGEST), method="bounded", options={"xatol": _PRECISION})
-    phi = float(best.x) if best.fun < deviance(0.0) else 0.0
+    phi = 0.0
+    if deviance(_STEP) < deviance(0.0):  # there is one minimum, which is at 0 if it increases from there
+        best = minimize_scalar(deviance, bounds=(0.0, LARGEST), method="bounded", options={"xatol": _PRECISION})
+        phi = float(best.x) if best.fun < deviance(0.0) else 0.0
     # curvature of -2 log L
     low = max(phi - _STEP, 0.0)
     points = np.array([low, low + _STEP, low + 2 * _STEP])
@@ -127,7 +130,7 @@ def correlated(white: Fit, order: Array, series: Index | None = None, *, typical
         phi=phi,
         u_phi=u_phi,
         independent=_independent(problem, order, series, phi),
-        gain=max(_deviance(near, at, order, series, 0.0) - _deviance(near, at, order, series, phi), 0.0),
+        gain=max(deviance(0.0) - deviance(phi) + float(np.arctanh(phi) / typical) ** 2, 0.0),
         _fitted=lambda its: fit(autoregressive(problem, order, its, series), start=at),
     )
 

@@ -26,6 +26,7 @@ contain the true figure in about 95 % of tests, on flat and on pointed paths.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.stats import norm
@@ -185,6 +186,13 @@ def _circle_of(deviation: Array) -> tuple[Array, Array, Array, Array]:
     """Return paths (..., n), the matrix from known values to their circle, which are known, and the circle (n, 3)."""
     *lead, paths, places = deviation.shape
     flat = deviation.reshape(*lead, paths * places)
-    design = np.tile(circle(middles(places)), (paths, 1))
     known = np.isfinite(flat.reshape(-1, paths * places)[0])
-    return flat, np.linalg.pinv(design[known]), known, design
+    return flat, *_projection(paths, places, known.tobytes())
+
+
+@lru_cache(maxsize=32)
+def _projection(paths: int, places: int, known: bytes) -> tuple[Array, Array, Array]:
+    """Return the matrix, what is known, and the circle, of `_circle_of`; read-only."""
+    design = np.tile(circle(middles(places)), (paths, 1))
+    which = np.frombuffer(known, dtype=bool)
+    return np.linalg.pinv(design[which]), which, design

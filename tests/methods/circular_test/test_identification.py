@@ -93,6 +93,7 @@ def ratios():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_intervals_of_the_parameters_hold_the_truth(ratios):
     held = (np.abs(ratios["parameters"]) <= 1.96).sum(axis=0)
     low, high = stats.binom.ppf([FALSE_ALARM / 20, 1 - FALSE_ALARM / 20], SEEDS, 0.95)
@@ -102,6 +103,7 @@ def test_intervals_of_the_parameters_hold_the_truth(ratios):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_intervals_of_the_figures_hold_the_truth(ratios):
     """Extreme values are not normal variables; two standard uncertainties contain the truth in 95 % of tests."""
     held = (np.abs(ratios["figures"]) <= 2).sum(axis=0)
@@ -112,6 +114,7 @@ def test_intervals_of_the_figures_hold_the_truth(ratios):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("decay", [1.0, 3.0])
 def test_a_spike_is_not_reduced_by_the_width_of_a_sector(decay):
     """G, H and F of the path itself: the mean over 2 degrees of a spike of 3 degrees is a quarter smaller."""
