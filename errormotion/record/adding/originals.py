@@ -57,8 +57,9 @@ def originals_of(paths: Sequence[Path]) -> dict[Path, Original]:
             size = require_regular(path).st_size
             digest = sha256_of(path)
         except OSError as error:
+            hint = ". A folder is added file by file" if path.is_dir() else ""
             raise DatasetError(
-                f"{path}: expected a file; {error.strerror}. A folder is added file by file.",
+                f"{path}: expected a file; {error.strerror or error}{hint}.",
                 code="add.file.unreadable",
             ) from error
         if twice := [
